@@ -1,0 +1,74 @@
+"""olpm-bench: one guided path tracer for Mitsuba 3, and what it takes to measure which guide is best.
+
+As a library, after `mi.set_variant`:
+
+    guide = olpm_bench.train(scene, "gaussian_mixture", passes=5)
+    image = mi.render(scene, integrator=olpm_bench.integrator(guide, max_depth=13), spp=64)
+
+or `olpm_bench.register()`, and then the Mitsuba plugin `guided_path`.
+"""
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import TYPE_CHECKING, Any
+
+from representations import _llvm
+
+_llvm.select()          # before the first `import drjit` of the process
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from olpm_bench.transport.guide import Guide
+    from olpm_bench.transport.path import GuidedPathIntegrator
+
+_registered: str | None = None      # the variant whose classes our integrators were made from
+
+
+def register() -> None:
+    """Make the Mitsuba plugin `guided_path`; call it after `mi.set_variant`, and again after a change of variant.
+
+    Raises:
+        ValueError: the variant is not one in which guiding works.
+    """
+    global _registered
+    import mitsuba as mi
+    variant = mi.variant()
+    if variant not in ("llvm_ad_rgb", "cuda_ad_rgb"):
+        raise ValueError(f"Mitsuba variant '{variant}': guiding needs llvm_ad_rgb or cuda_ad_rgb; call mi.set_variant first")
+    for name in ("olpm_bench.transport.path", "olpm_bench.transport.plugin"):
+        if name in sys.modules and _registered not in (None, variant):
+            importlib.reload(sys.modules[name])         # the base class belongs to a variant
+        importlib.import_module(name)
+    _registered = variant
+
+
+def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixture", *, max_depth: int = 13, seed: int = 0,
+          preset: str = "fast", **settings: Any) -> Guide:
+    """Train a guide on a scene.
+
+    Args:
+        representation: a registered name, or ``{"type": name, ...hyper-parameters}``.
+        max_depth: of the camera paths to be guided [segments].
+        preset, settings: of `olpm_bench.transport.settings.TrainingSettings`: passes, photons, importons, gather, ...
+
+    Returns:
+        A guide, which can be saved, loaded (`olpm_bench.transport.guide.Guide.load`) and handed to :func:`integrator`.
+    """
+    register()
+    from olpm_bench.transport import settings as options
+    from olpm_bench.transport import training
+    return training.train(scene, representation, options.training(preset, **settings), max_depth=max_depth, seed=seed)
+
+
+def integrator(guide: Guide | None = None, **settings: Any) -> GuidedPathIntegrator:
+    """A path tracer with a guide, or an unguided one.
+
+    Args:
+        settings: of `olpm_bench.transport.settings.IntegratorSettings`: max_depth, roulette, rr_depth, fraction.
+    """
+    register()
+    from olpm_bench.transport.path import GuidedPathIntegrator
+    from olpm_bench.transport.settings import IntegratorSettings, with_changes
+    return GuidedPathIntegrator(with_changes(IntegratorSettings(), settings), guide)

@@ -1,0 +1,526 @@
+"""Experiment files: TOML -> typed, checked, complete descriptions of every cell.
+
+Strict: an unknown key, a wrong type or a value out of range is a :class:`ConfigError` of one line that names the place
+and what is allowed there.  Nothing is rendered here and no scene is loaded; names of representations and of embedded
+scenes are looked up here and nowhere else.
+"""
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import inspect
+import json
+import math
+import os
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+import representations
+from olpm_bench import scenes as embedded
+from olpm_bench.bench.results import SCHEMA_VERSION, slug
+from olpm_bench.transport.settings import PRESETS, IntegratorSettings, TrainingSettings
+
+MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see run.pass_seed
+
+
+class ConfigError(ValueError):
+    """A mistake in an experiment file or on the command line; one line that says what is allowed."""
+
+
+class Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class Budget(Table):
+    """What a cell may spend: charged seconds, training included, or samples per pixel; exactly one of them.
+
+    checkpoints: images kept on the way, at log-spaced times (or sample counts); the last is the final image.
+    """
+    seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
+    spp: int | None = Field(None, ge=1)
+    checkpoints: int = Field(8, ge=1, le=64)
+
+    @model_validator(mode="after")
+    def _one(self) -> Budget:
+        if (self.seconds is None) == (self.spp is None):
+            raise ValueError("give either seconds or spp, and not both")
+        return self
+
+
+class Scene(Table):
+    """A scene and the image made of it.
+
+    name: an embedded scene; with `file`, a label of your choice.
+    file: Mitsuba XML, relative to the TOML.
+    parameters: of the embedded scene.
+    overrides: of the XML's own ``<default>`` values.
+    max_depth: wins over the integrator's.
+    reference: a reference folder, or an EXR of another renderer; by default it is found by the scene's key.
+    """
+    name: str = Field(min_length=1)
+    file: Path | None = Field(None, strict=False)
+    parameters: dict[str, Any] = {}
+    overrides: dict[str, Any] = {}
+    width: int = Field(ge=1, le=16384)
+    height: int = Field(ge=1, le=16384)
+    max_depth: int | None = None
+    reference: Path | None = Field(None, strict=False)
+
+    @field_validator("max_depth")
+    @classmethod
+    def _depth(cls, value: int | None) -> int | None:
+        if value is not None and value < 1 and value != -1:
+            raise ValueError("must be >= 1, or -1 for no limit")
+        return value
+
+    @property
+    def source(self) -> str:
+        """What `olpm_bench.scenes.load.load` takes: the embedded name or the path of the XML."""
+        return str(self.file) if self.file is not None else self.name
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Parameters of the embedded scene or overrides of the XML."""
+        return dict(self.overrides if self.file is not None else self.parameters)
+
+    def resolved_arguments(self) -> dict[str, Any]:
+        """`arguments`, with every default of an embedded scene written out."""
+        return dict(self.overrides) if self.file is not None else embedded.resolve(self.name, self.parameters)
+
+    def digest(self) -> str:
+        """Hash of all that determines the scene's radiance."""
+        return embedded.digest(self.file or self.name, self.arguments)
+
+
+class Method(Table):
+    """A method under test: the path tracer with one representation, or without a guide.
+
+    representation: ``{ type = name, ...hyper-parameters }``; none traces unguided.
+    integrator, training: what differs from the experiment's own tables.
+    """
+    name: str = Field(min_length=1)
+    representation: dict[str, Any] | None = None
+    integrator: dict[str, Any] = {}
+    training: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _sensible(self) -> Method:
+        if self.representation is not None and not isinstance(self.representation.get("type"), str):
+            raise ValueError(f"representation needs a type; known: {', '.join(representations.names())}")
+        if self.representation is None and self.training:
+            raise ValueError("has [training] changes but no representation to train")
+        if "max_depth" in self.integrator:
+            raise ValueError("max_depth belongs in [integrator] or [[scene]]: all methods share one reference")
+        return self
+
+    @property
+    def representation_name(self) -> str | None:
+        return self.representation["type"] if self.representation is not None else None
+
+    @property
+    def representation_parameters(self) -> dict[str, Any]:
+        return {k: v for k, v in (self.representation or {}).items() if k != "type"}
+
+    def create(self) -> Any:
+        """The representation, or None for the unguided path tracer."""
+        if self.representation is None:
+            return None
+        return representations.create(self.representation["type"], **self.representation_parameters)
+
+
+@dataclass(frozen=True)
+class CellSpec:
+    """All that determines a cell: one scene, one method, one seed, one budget."""
+    scene: Scene
+    method: Method
+    seed: int
+    integrator: IntegratorSettings          # with the scene's max_depth
+    training: TrainingSettings | None       # None: unguided
+    budget: Budget
+
+    @property
+    def reference_key(self) -> str:
+        return reference_key(self.scene, self.integrator.max_depth)
+
+    def config(self) -> dict[str, Any]:
+        """The cell as JSON, every default written out."""
+        return {
+            "scene": self.scene.name, "file": self.scene.file and self.scene.file.name,
+            "parameters": self.scene.resolved_arguments(), "width": self.scene.width, "height": self.scene.height,
+            "method": self.method.name, "representation": _representation_defaults(self.method), "seed": self.seed,
+            "integrator": dataclasses.asdict(self.integrator),
+            "training": self.training and dataclasses.asdict(self.training),
+            "budget": self.budget.model_dump(),
+        }
+
+    @functools.cached_property
+    def key(self) -> str:
+        """Hash of everything that determines the cell: change any of it and the cell is redone."""
+        config = {k: v for k, v in self.config().items() if k not in ("scene", "file", "method")}      # labels
+        return _hash({**config, "scene": self.scene.digest(), "code": _representation_code(self.method),
+                      "mitsuba": importlib.metadata.version("mitsuba"), "schema_version": SCHEMA_VERSION})
+
+    def __str__(self) -> str:
+        return f"{self.scene.name} / {self.method.name} / seed {self.seed}"
+
+
+class Experiment(Table):
+    """A whole experiment file.  `seeds = 3` means seeds 0, 1, 2."""
+    schema_version: int = SCHEMA_VERSION
+    title: str
+    description: str = ""
+    seeds: list[int] = [0]
+    budget: Budget
+    scene: list[Scene] = Field(min_length=1)
+    integrator: IntegratorSettings = IntegratorSettings()
+    training: TrainingSettings = TrainingSettings()
+    method: list[Method] = Field(min_length=1)
+    _path: Path = PrivateAttr(Path("EXPERIMENT.toml"))
+
+    @property
+    def path(self) -> Path:
+        """The file it was read from."""
+        return self._path
+
+    @field_validator("schema_version")
+    @classmethod
+    def _schema(cls, value: int) -> int:
+        if not 1 <= value <= SCHEMA_VERSION:
+            raise ValueError(f"must be <= {SCHEMA_VERSION}, the newest this version of olpm-bench reads")
+        return value
+
+    @field_validator("seeds", mode="before")
+    @classmethod
+    def _count_of_seeds(cls, value: Any) -> Any:
+        if isinstance(value, int) and not isinstance(value, bool):
+            if not 1 <= value <= MAX_SEED + 1:
+                raise ValueError(f"must be 1 to {MAX_SEED + 1} (a count), or a list of seeds")
+            return list(range(value))
+        return value
+
+    @field_validator("seeds")
+    @classmethod
+    def _seeds(cls, value: list[int]) -> list[int]:
+        if not value or len(set(value)) < len(value) or not all(0 <= s <= MAX_SEED for s in value):
+            raise ValueError(f"must be different numbers from 0 to {MAX_SEED}")
+        return value
+
+    @field_validator("training", mode="before")
+    @classmethod
+    def _preset(cls, value: Any) -> Any:
+        if not isinstance(value, dict) or "preset" not in value:
+            return value
+        preset = value["preset"]
+        if preset not in PRESETS:
+            raise ValueError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
+        return {**PRESETS[preset], **{k: v for k, v in value.items() if k != "preset"}}
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Experiment:
+        for kind, names in (("methods", [m.name for m in self.method]), ("scenes", [s.name for s in self.scene])):
+            folders: dict[str, str] = {}
+            for name in names:
+                other = folders.setdefault(slug(name), name)
+                if names.count(name) > 1:
+                    raise ValueError(f"two {kind} of one name {name!r}; names must differ")
+                if other != name:
+                    raise ValueError(f"{kind} {other!r} and {name!r} would share the folder '{slug(name)}'; names must "
+                                     "differ")
+        for method in self.method:
+            self.training_of(method)
+            for scene in self.scene:
+                self.integrator_of(scene, method)
+        return self
+
+    def integrator_of(self, scene: Scene, method: Method) -> IntegratorSettings:
+        changes = dict(method.integrator)
+        if scene.max_depth is not None:
+            changes["max_depth"] = scene.max_depth
+        return _changed(self.integrator, changes, f"method {method.name!r} integrator")
+
+    def training_of(self, method: Method) -> TrainingSettings | None:
+        """The method's training; None if it has no representation.  Its own `preset` starts from that preset."""
+        if method.representation is None:
+            return None
+        changes, where = dict(method.training), f"method {method.name!r} training"
+        if "preset" in changes:
+            preset = changes.pop("preset")
+            if preset not in PRESETS:
+                raise ValueError(f"{where}: unknown preset {preset!r}; known: {', '.join(PRESETS)}")
+            return _changed(TrainingSettings(**PRESETS[preset]), changes, where)
+        return _changed(self.training, changes, where)
+
+    def cells(self) -> list[CellSpec]:
+        """Every cell in the order of running: methods innermost, so that they share the machine's good and bad
+        hours."""
+        return [CellSpec(scene, method, seed, self.integrator_of(scene, method), self.training_of(method), self.budget)
+                for scene in self.scene for seed in self.seeds for method in self.method]
+
+    def reference_key(self, scene: Scene) -> str:
+        return reference_key(scene, self.max_depth(scene))
+
+    def max_depth(self, scene: Scene) -> int:
+        return self.integrator.max_depth if scene.max_depth is None else scene.max_depth
+
+    def resolved(self, relative_to: Path | None = None) -> dict[str, Any]:
+        """The experiment with every default written out, as TOML holds it; paths relative to a folder if given."""
+        def path(p: Path | str) -> str:
+            return Path(os.path.relpath(p, relative_to)).as_posix() if relative_to is not None else str(p)
+
+        scenes: list[dict[str, Any]] = []
+        methods: list[dict[str, Any]] = []
+        for scene in self.scene:
+            table: dict[str, Any] = scene.model_dump(exclude={"file", "reference", "parameters", "overrides"})
+            table["max_depth"] = self.max_depth(scene)
+            if scene.file is None:
+                table["parameters"] = scene.resolved_arguments()
+            else:
+                table |= {"file": path(scene.file), "overrides": scene.overrides}
+            if scene.reference is not None:
+                table["reference"] = path(scene.reference)
+            scenes.append(table)
+        for method in self.method:
+            table, training = {"name": method.name}, self.training_of(method)
+            if training is not None:
+                kind = method.representation_name or ""
+                file, separator, attribute = kind.rpartition(":")
+                table["representation"] = _representation_defaults(method)
+                if separator:
+                    table["representation"]["type"] = f"{path(file)}:{attribute}"
+                table["training"] = dataclasses.asdict(training)
+            integrator = dataclasses.asdict(self.integrator_of(self.scene[0], method))
+            table["integrator"] = {k: v for k, v in integrator.items() if k != "max_depth"}
+            methods.append(table)
+        return {
+            "schema_version": SCHEMA_VERSION, "title": self.title, "description": self.description, "seeds": self.seeds,
+            "budget": self.budget.model_dump(exclude_none=True), "integrator": dataclasses.asdict(self.integrator),
+            "training": dataclasses.asdict(self.training), "scene": scenes, "method": methods}
+
+    def toml(self, relative_to: Path | None = None) -> str:
+        """`resolved` as TOML; reading it back gives the same cells."""
+        return "\n".join(_toml_lines(self.resolved(relative_to))) + "\n"
+
+
+def reference_key(scene: Scene, max_depth: int) -> str:
+    """Folder of a scene's reference: readable, and different whenever the converged image may differ."""
+    digest = _hash({"scene": scene.digest(), "width": scene.width, "height": scene.height, "max_depth": max_depth})
+    return f"{slug(scene.name)}-{scene.width}x{scene.height}-{digest[:8]}"
+
+
+def load(path: Path | str, scenes: dict[str, Path] | None = None) -> Experiment:
+    """Read and check an experiment file.
+
+    Args:
+        path: the TOML; the paths in it are relative to its folder.
+        scenes: name of a scene of the file -> XML to use in its place.
+
+    Raises:
+        ConfigError: anything wrong with the file, with the files it names, or with `scenes`.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"experiment file {path}: there is no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"experiment file {path}: cannot be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path.name} is not valid TOML: {error}") from None
+    experiment = parse(data, path.name, path.parent, scenes)
+    experiment._path = path
+    return experiment
+
+
+def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Path] | None = None) -> Experiment:
+    """Check what a TOML holds; `source` names it in messages, `folder` is what its paths are relative to.
+
+    Raises:
+        ConfigError: as :func:`load`.
+    """
+    data = _without_paths(data, folder)
+    _replace_scenes(data, scenes or {}, source)
+    try:
+        # As JSON, because there strict means strict and still turns objects into dataclasses.
+        experiment = Experiment.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, source)) from None
+    for scene in experiment.scene:
+        _check_scene(scene, source)
+    for method in experiment.method:
+        try:
+            method.create()
+        except representations.RepresentationError as error:
+            raise ConfigError(f"{source} [[method]] {method.name!r}: {error}") from None
+    return experiment
+
+
+def _without_paths(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A copy of `data` in which every path is absolute."""
+    data = json.loads(json.dumps(data, default=str))
+    for scene in _tables(data.get("scene")):
+        for key in ("file", "reference"):
+            if isinstance(scene.get(key), str):
+                scene[key] = str((folder / scene[key]).resolve())
+    for method in _tables(data.get("method")):
+        representation = method.get("representation")
+        kind = representation.get("type") if isinstance(representation, dict) else None
+        if isinstance(representation, dict) and isinstance(kind, str) and ".py:" in kind:
+            file, _, attribute = kind.rpartition(":")
+            representation["type"] = f"{(folder / file).resolve()}:{attribute}"
+    return data
+
+
+def _tables(value: Any) -> Iterator[dict[str, Any]]:
+    return (table for table in (value if isinstance(value, list) else []) if isinstance(table, dict))
+
+
+def _replace_scenes(data: dict[str, Any], scenes: dict[str, Path], source: str) -> None:
+    known: dict[Any, dict[str, Any]] = {table.get("name"): table for table in _tables(data.get("scene"))}
+    for name, file in scenes.items():
+        if name not in known:
+            raise ConfigError(f"--scene {name}={file}: no scene '{name}' in {source}; "
+                              f"known: {', '.join(map(str, known))}")
+        known[name]["file"] = str(Path(file).resolve())
+
+
+def _check_scene(scene: Scene, source: str) -> None:
+    where = f"{source} [[scene]] {scene.name!r}"
+    if scene.file is not None:
+        if not scene.file.is_file():
+            raise ConfigError(f"{where}: file {scene.file}: there is no such file; "
+                              f"--scene {scene.name}=PATH points it elsewhere")
+        if scene.parameters:
+            raise ConfigError(f"{where}: parameters belong to embedded scenes; a file takes overrides")
+    else:
+        known = embedded.names()
+        if scene.name not in known:
+            raise ConfigError(f"{where}: unknown scene; known: {', '.join(known)}, or give file = \"scene.xml\"")
+        if scene.overrides:
+            raise ConfigError(f"{where}: overrides belong to files; an embedded scene takes parameters")
+        try:
+            embedded.resolve(scene.name, scene.parameters)
+        except embedded.SceneError as error:
+            raise ConfigError(f"{where}: {error}") from None
+    if scene.reference is not None and not scene.reference.exists():
+        raise ConfigError(f"{where}: reference {scene.reference}: there is no such file or folder")
+
+
+def _changed(settings: Any, changes: dict[str, Any], where: str) -> Any:
+    """`settings` with some fields changed and everything checked again."""
+    known = [f.name for f in dataclasses.fields(settings)]
+    for key in changes:
+        if key not in known:
+            raise ValueError(f"{where}: unknown key '{key}'; known: {', '.join(known)}")
+    try:
+        data = json.dumps({**dataclasses.asdict(settings), **changes})
+        return TypeAdapter(type(settings)).validate_json(data, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{where}: {' '.join([*map(str, first['loc']), _plain(first)])}") from None
+
+
+TABLES = {"budget": Budget, "scene": Scene, "method": Method,
+          "integrator": IntegratorSettings, "training": TrainingSettings}
+
+
+UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+
+
+def _explain(error: ValidationError, source: str) -> str:
+    """The first mistake that pydantic found, in one line."""
+    first = min(error.errors(), key=lambda e: e["type"] not in UNKNOWN)      # a misspelt key is missing, too
+    parts = list(first["loc"])
+    table = parts[0] if parts and parts[0] in TABLES else None
+    cls: Any = TABLES.get(str(table), Experiment)
+    where = source
+    if table is not None and len(parts) > 1 and isinstance(parts[1], int):
+        where, keys = f"{source} [[{table}]] {parts[1] + 1}", parts[2:]
+    elif table is not None:
+        where, keys = f"{source} [{table}]", parts[1:]
+    else:
+        keys = parts
+    if first["type"] in UNKNOWN:
+        known = list(cls.model_fields) if issubclass(cls, BaseModel) else [f.name for f in dataclasses.fields(cls)]
+        if cls is TrainingSettings:
+            known.insert(0, "preset")
+        return f"unknown key '{keys[-1]}' in {where}; known: {', '.join(known)}"
+    if first["type"] in ("missing", "missing_argument"):
+        return f"missing key '{keys[-1]}' in {where}" if keys else f"missing table '{table}' in {source}"
+    name = ".".join(str(k) for k in keys)
+    return f"{where}: {name + ' ' if name else ''}{_plain(first)}"
+
+
+def _plain(error: Any) -> str:
+    """A pydantic error without its vocabulary: the value and what is allowed."""
+    if error["type"] == "value_error":
+        text = str(error["ctx"]["error"])
+        scalar = isinstance(error["input"], (int, float, str)) and text.startswith("must")
+        return f"= {error['input']!r}: {text}" if scalar else text
+    message = error["msg"].replace("Input should be", "must be")
+    return f"= {error['input']!r}: {message}" if not isinstance(error["input"], dict) else message
+
+
+def _representation_defaults(method: Method) -> dict[str, Any] | None:
+    """The representation's table with every hyper-parameter."""
+    if method.representation is None:
+        return None
+    signature = inspect.signature(representations.find(method.representation["type"]))
+    defaults = {name: p.default for name, p in signature.parameters.items()
+                if isinstance(p.default, (bool, int, float, str, list))}
+    return {**defaults, **method.representation}
+
+
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def _representation_code(method: Method) -> str | None:
+    """The source behind ``FILE.py:Class``; a registered name stands for itself."""
+    kind = method.representation_name
+    return hashlib.sha256(Path(kind.rpartition(":")[0]).read_bytes()).hexdigest() if kind and ".py:" in kind else None
+
+
+def _toml_lines(data: dict[str, Any]) -> Iterator[str]:
+    tables = {k: v for k, v in data.items() if isinstance(v, dict)}
+    arrays = {k: v for k, v in data.items() if isinstance(v, list) and v and all(isinstance(t, dict) for t in v)}
+    for key, value in data.items():
+        if key not in tables and key not in arrays:
+            yield f"{_toml_key(key)} = {_toml_value(value)}"
+    named = [(f"[{_toml_key(key)}]", table) for key, table in tables.items()]
+    named += [(f"[[{_toml_key(key)}]]", table) for key, array in arrays.items() for table in array]
+    for head, table in named:
+        yield from ("", head, *(f"{_toml_key(k)} = {_toml_value(v)}" for k, v in table.items() if v is not None))
+
+
+def _toml_key(key: str) -> str:
+    return key if key and all(c.isascii() and (c.isalnum() or c in "_-") for c in key) else json.dumps(key)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, dict):
+        items = ", ".join(f"{_toml_key(k)} = {_toml_value(v)}" for k, v in value.items() if v is not None)
+        return f"{{ {items} }}" if items else "{}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_toml_value, value)) + "]"
+    return repr(value) if isinstance(value, (int, float)) else json.dumps(str(value))
+

@@ -1,0 +1,122 @@
+"""The error metrics: how far an image `x` is from its reference `r`.
+
+Both are linear RGB (h, w, 3); the mean runs over pixels and channels, in float64.  Nothing is clamped first:
+fireflies count, and a pixel that is NaN or infinite makes the metric so.
+"""
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from olpm_bench.report import tonemap
+
+EPSILON = 0.01          # of the relative metrics, in units of radiance
+WORST = 0.001           # fraction of pixels that relmse_trimmed leaves out
+
+
+@functools.cache
+def _luminance_weights() -> np.ndarray:
+    import colour  # takes seconds
+
+    weights: np.ndarray = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ[1]
+    return weights
+
+
+def luminance(image: np.ndarray) -> np.ndarray:
+    """Rec. 709 luminance of linear RGB: (..., 3) -> (...), float64."""
+    return image.astype(np.float64) @ _luminance_weights()
+
+
+def _pair(x: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if x.shape != r.shape or x.ndim != 3:
+        raise ValueError(f"image {x.shape} and reference {r.shape}: both must be (height, width, channels)")
+    return x.astype(np.float64), r.astype(np.float64)
+
+
+def l1(x: np.ndarray, r: np.ndarray) -> float:
+    """Mean |x - r|: the headline, as in the talk."""
+    x, r = _pair(x, r)
+    return float(np.mean(np.abs(x - r)))
+
+
+def mape(x: np.ndarray, r: np.ndarray) -> float:
+    """Mean |x - r| / (r + 0.01)."""
+    x, r = _pair(x, r)
+    return float(np.mean(np.abs(x - r) / (r + EPSILON)))
+
+
+def smape(x: np.ndarray, r: np.ndarray) -> float:
+    """Mean 2 |x - r| / (x + r + 0.01)."""
+    x, r = _pair(x, r)
+    return float(np.mean(2 * np.abs(x - r) / (x + r + EPSILON)))
+
+
+def _relative_squared_error(x: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """(h, w, channels)."""
+    x, r = _pair(x, r)
+    return (x - r) ** 2 / (r**2 + EPSILON)
+
+
+def relmse(x: np.ndarray, r: np.ndarray) -> float:
+    """Mean (x - r)^2 / (r^2 + 0.01)."""
+    return float(np.mean(_relative_squared_error(x, r)))
+
+
+def relmse_trimmed(x: np.ndarray, r: np.ndarray) -> float:
+    """relMSE without the worst 0.1 % of *pixels* (rounded down); shown beside the untrimmed one, never alone."""
+    pixels = np.sort(_relative_squared_error(x, r).mean(axis=-1), axis=None)       # NaN sorts last: keep it in
+    if np.isnan(pixels[-1]):
+        return float("nan")
+    return float(np.mean(pixels[:pixels.size - int(WORST * pixels.size)]))
+
+
+def mse_debiased(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Mean (x - a)(x - b): unbiased for the squared error, `a` and `b` being independent halves of the reference."""
+    x, a = _pair(x, a)
+    x, b = _pair(x, b)
+    return float(np.mean((x - a) * (x - b)))
+
+
+def flip(x: np.ndarray, r: np.ndarray) -> float:
+    """Mean HDR-FLIP [Andersson et al. 2021], whose range of exposures comes from the reference alone."""
+    import flip_evaluator
+
+    _pair(x, r)
+    if not (np.isfinite(x).all() and np.isfinite(r).all()):
+        return float("nan")
+    test, reference = (np.maximum(image, 0).astype(np.float32) for image in (x, r))
+    return float(flip_evaluator.evaluate(reference, test, "HDR", applyMagma=False)[1])
+
+
+def ssim_error(x: np.ndarray, r: np.ndarray) -> float:
+    """1 - SSIM [Wang et al. 2004] of the tone-mapped images, at the reference's exposure."""
+    from skimage.metrics import structural_similarity
+
+    _pair(x, r)
+    exposure = tonemap.auto_exposure(r)
+    shown_x, shown_r = tonemap.encode(x, exposure), tonemap.encode(r, exposure)
+    return float(1 - structural_similarity(shown_x, shown_r, data_range=1, channel_axis=-1))
+
+
+def work_normalised_variance(images: Sequence[np.ndarray], seconds: float) -> float:
+    """Median over pixels of var / (mean^2 + 1e-3 imagemean^2), times seconds; needs no reference.
+
+    Args:
+        images: one (h, w, 3) per seed; variance (ddof = 1) and mean are those of the luminance over seeds.
+        seconds: charged seconds of one image.
+
+    Returns:
+        NaN where it has no value: a single seed, or black images.
+    """
+    if len(images) < 2:
+        return float("nan")
+    Y = np.stack([luminance(image) for image in images])
+    mean = Y.mean(axis=0)
+    with np.errstate(invalid="ignore"):
+        return float(np.median(Y.var(axis=0, ddof=1) / (mean**2 + 1e-3 * mean.mean() ** 2)) * seconds)
+
+
+METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
+    f.__name__: f for f in (l1, mape, smape, relmse, relmse_trimmed, flip, ssim_error)}

@@ -1,0 +1,61 @@
+"""How far a long command is: a bar with the time left on a terminal, a line now and then elsewhere.
+
+Drawn only when told to, between timed passes: a bar that redraws itself would run on the clock.
+"""
+from __future__ import annotations
+
+import sys
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+QUIET_SECONDS = 30.0        # between lines where there is no terminal
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C or SIGTERM is behind an error: while Dr.Jit traces a loop they become a RuntimeError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+class Bar:
+    """Progress of work whose total is known; a context manager.
+
+    Args:
+        total: all of the work, in any unit.
+    """
+
+    def __init__(self, total: float) -> None:
+        self.total, self.done, self.label = max(total, 1e-9), 0.0, ""
+        self.console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self.progress: Progress | None = None
+        self.drawn = time.monotonic()
+
+    def __enter__(self) -> Bar:
+        if sys.stderr.isatty():
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
+                       TimeRemainingColumn())
+            self.progress = Progress(*columns, console=self.console, auto_refresh=False, transient=True)
+            self.progress.start()
+            self.task = self.progress.add_task("", total=self.total)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.progress is not None:
+            self.progress.stop()
+
+    def at(self, done: float, label: str) -> None:
+        """`done` of the total is finished; draw it."""
+        self.done = min(done, self.total)
+        if self.progress is not None:
+            self.progress.update(self.task, completed=self.done, description=label)
+            self.progress.refresh()
+        elif time.monotonic() - self.drawn > QUIET_SECONDS:
+            self.drawn = time.monotonic()
+            self.say(f"{100 * self.done / self.total:3.0f} %  {label}")
+
+    def say(self, line: str) -> None:
+        """A line that stays."""
+        self.console.print(line, markup=False)

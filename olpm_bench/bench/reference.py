@@ -1,0 +1,144 @@
+"""References: converged images by Mitsuba's own unguided `path`, in two halves that share no random number.
+
+Made bit by bit: passes go to half A and half B in turn, what is there is saved every half minute, and another call
+goes on from it.  The halves give the noise floor below which no error can be measured.
+"""
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from olpm_bench.bench import environment, run
+from olpm_bench.bench.clock import Clock
+from olpm_bench.bench.config import CellSpec, Experiment
+from olpm_bench.bench.progress import Bar
+from olpm_bench.bench.results import (
+    Accumulator,
+    Reference,
+    ResultError,
+    find_reference,
+    locked,
+    read_reference,
+    write_reference,
+)
+
+ESTIMATOR = "path, unguided"
+SAVE_SECONDS = 30.0
+PASS_SECONDS = 1.0
+SEEDS = {"a": 2**31, "b": 2**31 + 2**30}        # cells stay below 2^30
+
+
+@dataclass
+class Halves:
+    """A reference in the making."""
+    a: Accumulator
+    b: Accumulator
+    seconds: float = 0.0        # charged, over all calls
+
+    @staticmethod
+    def start(width: int, height: int, found: Path | None) -> Halves:
+        """Empty, or what another call has left in a folder.
+
+        Raises:
+            ResultError: what is there is broken or newer.
+        """
+        if found is None:
+            return Halves(Accumulator.empty(height, width), Accumulator.empty(height, width))
+        r = read_reference(found, width, height)
+        try:
+            a = Accumulator.resume(r.a, r.a_variance, r.meta["spp_a"], r.meta["passes_a"])
+            b = Accumulator.resume(r.b, r.b_variance, r.meta["spp_b"], r.meta["passes_b"])
+            return Halves(a, b, r.meta["seconds"])
+        except KeyError as error:
+            raise ResultError(f"{found / 'meta.json'} is broken: no {error}; remove the folder") from None
+
+    def reference(self, meta: dict[str, Any]) -> Reference:
+        a, b = self.a, self.b
+        meta = {**meta, "spp_a": a.spp, "spp_b": b.spp, "passes_a": a.passes, "passes_b": b.passes,
+                "seconds": self.seconds, "noise": self.noise()}
+        return Reference(a=a.mean.astype(np.float32), a_variance=a.variance().astype(np.float32),
+                         b=b.mean.astype(np.float32), b_variance=b.variance().astype(np.float32), meta=meta)
+
+    def __str__(self) -> str:
+        return f"{self.a.spp} + {self.b.spp} spp in {self.seconds:.0f} s, noise {self.noise():.2%}"
+
+    def noise(self) -> float:
+        """Standard error of the mean of both halves over the image's mean."""
+        brightness = self.a.mean.mean() + self.b.mean.mean()
+        error = np.sqrt(self.a.variance() + self.b.variance()).mean()
+        return float(error / brightness) if brightness > 0 else float("inf")
+
+
+def improve(experiment: Experiment, root: Path, seconds: float) -> dict[str, Path]:
+    """Make, or go on with, the reference of every scene that does not name one.
+
+    Args:
+        root: the `--results` folder; references go to `root/references`.
+        seconds: charged seconds to spend on each scene.
+
+    Returns:
+        Scene name -> reference folder.
+
+    Raises:
+        ResultError: one that is there is broken or newer, or another process is at work on it.
+        SceneError, OSError: a scene cannot be used; a file cannot be written.
+    """
+    specs = {spec.scene.name: spec for spec in experiment.cells() if spec.scene.reference is None}
+    made = {}
+    with Bar(seconds * len(specs)) as bar:
+        for index, (name, spec) in enumerate(specs.items()):
+            made[name] = _improve(spec, experiment, root, seconds, bar, index * seconds)
+    return made
+
+
+def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float, bar: Bar, done: float) -> Path:
+    key = spec.reference_key
+    folder = root / "references" / key
+    with locked(folder):
+        halves = Halves.start(spec.scene.width, spec.scene.height,
+                              find_reference(key, run.reference_folders(experiment, root)))
+        scene = run.load_scene(spec)
+        integrator = mi.load_dict({"type": "path", "max_depth": experiment.max_depth(spec.scene), "rr_depth": 5})
+        meta = {"key": key, "scene": spec.scene.name, "width": spec.scene.width, "height": spec.scene.height,
+                "max_depth": experiment.max_depth(spec.scene), "parameters": spec.scene.resolved_arguments(),
+                "estimator": ESTIMATOR, "versions": environment.versions(), "commit": environment.commit()}
+        spp = _spp_of_pass(spec, scene, integrator, seconds)
+        clock, saved = Clock(count_wait=environment.uses_llvm()), time.monotonic()
+        before, resumed = halves.seconds, halves.a.passes + halves.b.passes
+        try:
+            while clock.charged < seconds or min(halves.a.passes, halves.b.passes) < 2:
+                for half, seed in ((halves.a, SEEDS["a"]), (halves.b, SEEDS["b"])):
+                    with clock.lap("render"):
+                        rendered = run.render_pass(scene, integrator, seed + half.passes, spp)
+                    image = run.to_numpy(rendered)
+                    run.check_pixels(image, seed + half.passes)
+                    half.add(image, spp)
+                halves.seconds = before + clock.charged
+                bar.at(done + clock.charged, f"{spec.scene.name}: {halves}")
+                if time.monotonic() - saved > SAVE_SECONDS:
+                    write_reference(folder, halves.reference(meta))
+                    saved = time.monotonic()
+        finally:                # also when interrupted: what is there is a valid reference
+            if min(halves.a.passes, halves.b.passes) >= 2 and halves.a.passes + halves.b.passes > resumed:
+                write_reference(folder, halves.reference(meta))
+    bar.say(f"{spec.scene.name}: {halves}, floor mean|A-B|/2 = {halves.reference(meta).noise_floor:.3g}: {folder}")
+    return folder
+
+
+def _spp_of_pass(spec: CellSpec, scene: mi.Scene, integrator: mi.Integrator, seconds: float) -> int:
+    """Compile, and find the samples a pixel of a pass of about a second (less for short budgets)."""
+    spp, limit = 1, run.power_of_two(run.largest_pass(spec))
+    target = min(PASS_SECONDS, seconds / 8)
+    while True:
+        run.render_pass(scene, integrator, run.WARM_UP_SEED, spp)           # compiles
+        start = time.perf_counter()
+        run.render_pass(scene, integrator, run.WARM_UP_SEED + 1, spp)
+        elapsed = time.perf_counter() - start
+        if elapsed > target / 4 or spp >= limit:
+            return run.power_of_two(min(limit, spp * target / max(elapsed, 1e-6)))
+        spp = min(4 * spp, limit)

@@ -1,0 +1,123 @@
+"""One image by one method: `olpm-bench render`, with the same clock and the same loop as a cell of an experiment."""
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from olpm_bench import scenes
+from olpm_bench.bench import environment, run
+from olpm_bench.bench.config import CellSpec, ConfigError, parse
+from olpm_bench.bench.progress import Bar
+from olpm_bench.bench.results import replacing, write_exr
+from olpm_bench.report import tonemap
+from olpm_bench.transport.guide import Guide
+
+TABLES = ("scene", "integrator", "training", "representation")
+
+
+def settings(assignments: list[str], tables: tuple[str, ...] = TABLES) -> dict[str, dict[str, Any]]:
+    """``["training.passes=5", ...]`` as nested tables; a value is TOML, or else a string.
+
+    Raises:
+        ConfigError: not ``table.key=value``, or an unknown table.
+    """
+    found: dict[str, dict[str, Any]] = {table: {} for table in tables}
+    for text in assignments:
+        left, equals, value = text.partition("=")
+        table, dot, key = left.strip().partition(".")
+        if not equals or not dot or not key:
+            raise ConfigError(f"--set {text}: must be {tables[0]}.key=value")
+        if table not in found:
+            raise ConfigError(f"--set {text}: unknown table '{table}'; known: {', '.join(tables)}")
+        found[table][key] = parse_value(value.strip())
+    return found
+
+
+def parse_value(text: str) -> Any:
+    """``5``, ``0.5``, ``true``, ``[1, 2]``, ``"nearest"`` as TOML reads them; anything else is a string."""
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+    return value if isinstance(value, (bool, int, float, str, list)) else text
+
+
+def cell(scene: str, method: str, assignments: list[str], *, seconds: float | None, spp: int | None,
+         width: int, height: int, max_depth: int | None, seed: int) -> CellSpec:
+    """The cell that the options of `olpm-bench render` describe.
+
+    Raises:
+        ConfigError: any of them is wrong.
+    """
+    if (seconds is None) == (spp is None):
+        raise ConfigError("give either --seconds or --spp, and not both")
+    tables = settings(assignments)
+    is_file = scenes.is_file(scene)
+    scene_table: dict[str, Any] = {"name": scene, "width": width, "height": height}
+    if is_file:
+        path = Path(scene).resolve()
+        scene_table |= {"name": path.parent.name if path.stem == "scene" else path.stem, "file": scene,
+                        "overrides": tables["scene"]}
+    else:
+        scene_table["parameters"] = tables["scene"]
+    if max_depth is not None:
+        scene_table["max_depth"] = max_depth
+    method_table: dict[str, Any] = {"name": method}
+    if method != "unguided":
+        method_table["representation"] = {"type": method, **tables["representation"]}
+    elif tables["representation"] or tables["training"]:
+        raise ConfigError("--set training.* and representation.* need a --method with a representation")
+    budget = {"seconds": seconds} if seconds is not None else {"spp": spp}
+    data = {"title": f"{scene}, {method}", "seeds": [seed], "budget": budget, "scene": [scene_table],
+            "integrator": tables["integrator"], "training": tables["training"], "method": [method_table]}
+    return parse(data, "command line", Path.cwd()).cells()[0]
+
+
+def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
+           load_guide: Path | None = None) -> dict[str, Any]:
+    """Render one image to `out` (EXR: mean, variance of the mean, count) and, tone-mapped, to the PNG beside it.
+
+    Args:
+        save_guide, load_guide: where to leave the trained guide; which guide to use in place of training.
+
+    Returns:
+        Timings, counts and versions, for JSON.
+
+    Raises:
+        ConfigError, ValueError, SceneError, OSError: wrong options or files; CellFailedError: an invalid image.
+    """
+    if out.suffix.lower() != ".exr":
+        raise ConfigError(f"--out {out}: must end in .exr")
+    if spec.training is None and (save_guide or load_guide):
+        raise ConfigError("--save-guide and --load-guide need a --method with a representation")
+    for path in (out, save_guide):
+        if path is not None and not path.parent.is_dir():
+            raise ConfigError(f"{path}: there is no folder {path.parent}")
+    guide = _load_guide(load_guide, spec) if load_guide is not None else None
+    scene = run.load_scene(spec)
+    with Bar(1.0) as bar:
+        bar.at(0.0, "compiling")
+        warm = run.warm_up(spec, scene, guide)
+        done = run.measure(spec, scene, warm, guide, bar.at)
+    if save_guide is not None and done.guide is not None:
+        with replacing(save_guide) as beside:
+            done.guide.save(beside)
+    write_exr(out, done.image, {**spec.config(), **done.info})
+    png = out.with_suffix(".png")
+    tonemap.write_png(png, tonemap.srgb(done.image["mean"], tonemap.auto_exposure(done.image["mean"])))
+    return {**{k: v for k, v in done.info.items() if k != "key"}, **spec.config(), "out": str(out), "png": str(png),
+            "guide": str(save_guide or load_guide) if save_guide or load_guide else None, "trace": done.trace,
+            "versions": environment.versions(), "variant": mi.variant(), "commit": environment.commit()}
+
+
+def _load_guide(path: Path, spec: CellSpec) -> Guide:
+    if not path.is_file():
+        raise ConfigError(f"--load-guide {path}: there is no such file")
+    guide = Guide.load(path)
+    if guide.specification.get("type") != spec.method.representation_name:
+        raise ConfigError(f"--load-guide {path} holds a guide of type '{guide.specification.get('type')}', "
+                          f"--method is '{spec.method.representation_name}'")
+    return guide

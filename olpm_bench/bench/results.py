@@ -1,0 +1,491 @@
+"""Where results live, and in which form: the only place that knows.
+
+A result folder (`results/<stem of the TOML>`):
+
+    experiment.toml  env.json  summary.json  table.csv  figure.png  figure.pdf  sheet.png
+    cells/<scene>/<method>/<seed>/cell.json         written last: with it the cell is complete
+                                  trace.jsonl       one line a checkpoint
+                                  image.exr         parts mean, variance (of the mean), count
+                                  checkpoints.exr   parts 0, 1, ...: the mean at each line of the trace
+                                  failed.json       why there is no cell.json
+                                  lock              who is at work on it
+    references/<scene-key>/{reference.exr, meta.json}
+
+Every file is written beside its place and renamed, so that it is whole or not there.  JSON has no NaN: null.
+"""
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import re
+import shutil
+import socket
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SCHEMA_VERSION = 1
+
+
+class ResultError(ValueError):
+    """A result that is missing, broken, or of a newer schema; the message names the file and what to do."""
+
+
+class NewerSchemaError(ResultError):
+    """A file of a later version of olpm-bench: read by nobody here, and overwritten by nobody here."""
+
+
+class LockedError(ResultError):
+    """Another process is at work on the cell or reference."""
+
+
+def slug(name: str) -> str:
+    """A name as a folder: letters, digits, dot, dash and underscore."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed"
+
+
+# ---------------------------------------------------------------- files
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a path beside `path` to write to; it takes the place of `path` if the body succeeds, else it goes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield beside
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    with replacing(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON can hold it: NumPy scalars become Python's, NaN and infinity become null."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)
+
+
+def write_json(path: Path, value: Any) -> None:
+    write_text(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object of ours.
+
+    Raises:
+        ResultError: missing or broken.
+        NewerSchemaError: written by a later version.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ResultError(f"{path}: there is no such file") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ResultError(f"{path} is broken: {error}") from None
+    if not isinstance(value, dict):
+        raise ResultError(f"{path} is broken: not a JSON object")
+    check_schema(path, value.get("schema_version"))
+    return value
+
+
+def check_schema(path: Path, version: Any) -> None:
+    """
+    Raises:
+        ResultError: no version; NewerSchemaError: a newer one than ours.
+    """
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise ResultError(f"{path}: schema_version = {version!r}; known: 1 to {SCHEMA_VERSION}")
+    if version > SCHEMA_VERSION:
+        raise NewerSchemaError(f"{path}: schema_version = {version} is newer than this olpm-bench, which reads up to "
+                               f"{SCHEMA_VERSION}; update it, or use another --results folder")
+
+
+def write_exr(path: Path, parts: dict[str, np.ndarray], header: dict[str, Any] | None = None) -> None:
+    """A multi-part float32 EXR.
+
+    Args:
+        parts: name -> (h, w, 3) as RGB or (h, w) as Y.
+        header: kept as JSON in the attribute `olpm_bench` of the first part.
+
+    Raises:
+        OSError: cannot be written, e.g. the disk is full.
+    """
+    import OpenEXR
+
+    common = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    exr: list[OpenEXR.Part] = []
+    for name, image in parts.items():
+        attributes = dict(common)
+        if header and not exr:
+            attributes["olpm_bench"] = json.dumps(plain(header), allow_nan=False)
+        channel = {"RGB" if image.ndim == 3 else "Y": np.ascontiguousarray(image, dtype=np.float32)}
+        exr.append(OpenEXR.Part(attributes, channel, name))
+    with replacing(path) as beside:
+        try:
+            OpenEXR.File(exr).write(str(beside))
+            OpenEXR.File(str(beside))           # the last buffer is flushed without a check: read it back
+        except (RuntimeError, ValueError) as error:
+            full = shutil.disk_usage(path.parent).free < sum(i.nbytes for i in parts.values())
+            code = errno.ENOSPC if full or "No space" in str(error) else errno.EIO
+            raise OSError(code, os.strerror(code) if code == errno.ENOSPC else str(error), str(path)) from None
+
+
+def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """All parts, (h, w, 3) or (h, w, 1) float32, and the JSON of `write_exr`.
+
+    Raises:
+        ResultError: missing or broken.
+    """
+    import OpenEXR
+
+    if not path.is_file():
+        raise ResultError(f"{path}: there is no such file")
+    try:
+        exr = OpenEXR.File(str(path))
+        parts, header = {}, {}
+        for index, part in enumerate(exr.parts):
+            channels = part.channels
+            if {"R", "G", "B"} <= channels.keys():
+                pixels = np.stack([channels[c].pixels for c in "RGB"], axis=-1)
+            else:
+                pixels = next(channels[c] for c in ("RGB", "RGBA", "Y") if c in channels).pixels
+            pixels = pixels[..., :3] if pixels.ndim == 3 else pixels[..., None]
+            parts[part.name() or str(index)] = np.asarray(pixels, np.float32)
+            if index == 0:
+                header = json.loads(part.header.get("olpm_bench", "{}"))
+    except (RuntimeError, ValueError, StopIteration, AttributeError) as error:
+        raise ResultError(f"{path} is broken: {str(error) or 'no RGB or Y channel'}") from None
+    return parts, header
+
+
+# ---------------------------------------------------------------- cells
+
+@dataclass
+class Cell:
+    """A complete cell: what was measured, and where its images are."""
+    scene: str
+    method: str
+    seed: int
+    info: dict[str, Any]            # cell.json
+    trace: list[dict[str, Any]]     # one dict a checkpoint
+    folder: Path
+
+    def image(self) -> dict[str, np.ndarray]:
+        """``mean`` (h, w, 3), ``variance`` of the mean (h, w, 3; infinite after a single pass), ``count`` (h, w, 1)."""
+        parts, _ = read_exr(self.folder / "image.exr")
+        for name in ("mean", "variance", "count"):
+            if name not in parts:
+                raise ResultError(f"{self.folder / 'image.exr'} is broken: no part '{name}'")
+        return parts
+
+    def checkpoints(self) -> list[np.ndarray]:
+        """The mean image (h, w, 3) at each line of the trace."""
+        parts, _ = read_exr(self.folder / "checkpoints.exr")
+        if set(parts) != {str(i) for i in range(len(self.trace))}:
+            raise ResultError(f"{self.folder / 'checkpoints.exr'} is broken: {len(parts)} images for {len(self.trace)} "
+                              "checkpoints")
+        return [parts[str(i)] for i in range(len(self.trace))]
+
+
+@dataclass
+class Accumulator:
+    """Running mean of passes, and the variance of that mean from their spread (Welford 1962, weighted by samples).
+
+    Pixels are float64: a long render adds many small passes.
+    """
+    mean: np.ndarray        # (h, w, 3)
+    m2: np.ndarray          # (h, w, 3) sum over passes of spp (x - mean)^2
+    spp: int = 0
+    passes: int = 0
+
+    @staticmethod
+    def empty(height: int, width: int) -> Accumulator:
+        return Accumulator(np.zeros((height, width, 3)), np.zeros((height, width, 3)))
+
+    @staticmethod
+    def resume(mean: np.ndarray, variance: np.ndarray, spp: int, passes: int) -> Accumulator:
+        """The accumulator whose mean, variance and counts these are."""
+        return Accumulator(mean.astype(np.float64), variance.astype(np.float64) * max(passes - 1, 0) * spp, spp, passes)
+
+    def add(self, image: np.ndarray, spp: int) -> None:
+        """Add a pass: an image (h, w, 3) of `spp` samples a pixel."""
+        self.spp += spp
+        self.passes += 1
+        delta = image - self.mean
+        self.mean += delta * (spp / self.spp)
+        self.m2 += spp * delta * (image - self.mean)
+
+    def variance(self) -> np.ndarray:
+        """Variance of `mean` (h, w, 3); infinite before there are two passes."""
+        if self.passes < 2:
+            return np.full_like(self.mean, np.inf)
+        return self.m2 / ((self.passes - 1) * self.spp)
+
+
+@dataclass
+class Reference:
+    """A converged image, as two halves made with different seeds.
+
+    An EXR of another renderer has no halves: then a and b are the same image and the noise floor is unknown.
+    """
+    a: np.ndarray               # (h, w, 3) linear RGB
+    b: np.ndarray
+    a_variance: np.ndarray      # (h, w, 3) variance of the mean
+    b_variance: np.ndarray
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def has_halves(self) -> bool:
+        return self.a is not self.b
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Both halves together, weighted by their samples (h, w, 3)."""
+        if not self.has_halves:
+            return self.a
+        n_a, n_b = self.meta["spp_a"], self.meta["spp_b"]
+        return ((n_a * self.a.astype(np.float64) + n_b * self.b) / (n_a + n_b)).astype(np.float32)
+
+    @property
+    def noise_floor(self) -> float | None:
+        """mean |A - B| / 2: about the L1 error of the mean; None if unknown."""
+        return float(np.mean(np.abs(self.a.astype(np.float64) - self.b))) / 2 if self.has_halves else None
+
+
+class Results:
+    """The result folder of one experiment.
+
+    Args:
+        folder: `<results>/<stem of the TOML>`; need not exist.
+
+    Raises:
+        NewerSchemaError: the folder was written by a later version.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder)
+        for name in ("summary.json", "env.json"):
+            try:
+                read_json(self.folder / name)
+            except NewerSchemaError:
+                raise
+            except ResultError:         # missing or broken: both are written anew
+                continue
+        try:
+            path = self.folder / "experiment.toml"
+            check_schema(path, tomllib.loads(path.read_text(encoding="utf-8"))["schema_version"])
+        except NewerSchemaError:
+            raise
+        except (OSError, ValueError, KeyError):
+            return
+
+    def write_json(self, name: str, value: dict[str, Any]) -> None:
+        write_json(self.folder / name, value)
+
+    def write_text(self, name: str, text: str) -> None:
+        write_text(self.folder / name, text)
+
+    def cell_folder(self, scene: str, method: str, seed: int) -> Path:
+        return self.folder / "cells" / slug(scene) / slug(method) / str(seed)
+
+    def read_cell(self, scene: str, method: str, seed: int) -> Cell | None:
+        """The cell if it is complete, else None.
+
+        Raises:
+            ResultError: it has a cell.json, but that or the trace is broken.
+            NewerSchemaError: of a later version.
+        """
+        folder = self.cell_folder(scene, method, seed)
+        if not (folder / "cell.json").exists():
+            return None
+        info = read_json(folder / "cell.json")
+        try:
+            lines = (folder / "trace.jsonl").read_text(encoding="utf-8").splitlines()
+            trace = [json.loads(line) for line in lines if line.strip()]
+        except (OSError, ValueError) as error:
+            raise ResultError(f"{folder / 'trace.jsonl'} is broken: {error}") from None
+        return Cell(scene, method, seed, info, trace, folder)
+
+    def verified_cell(self, scene: str, method: str, seed: int) -> Cell | None:
+        """As `read_cell`, and its images can be read."""
+        cell = self.read_cell(scene, method, seed)
+        if cell is not None:
+            cell.image()
+            cell.checkpoints()
+        return cell
+
+    def write_cell(self, scene: str, method: str, seed: int, info: dict[str, Any], trace: list[dict[str, Any]],
+                   image: dict[str, np.ndarray], checkpoints: list[np.ndarray],
+                   config: dict[str, Any] | None = None) -> Cell:
+        """Write a complete cell, cell.json last.
+
+        Args:
+            image: ``mean`` and ``variance`` (h, w, 3), ``count`` (h, w).
+            config: what goes into the header of the image.
+
+        Raises:
+            OSError: cannot be written; what was there is then incomplete, and nothing else is touched.
+        """
+        folder = self.cell_folder(scene, method, seed)
+        self.remove_cell(scene, method, seed)
+        write_exr(folder / "image.exr", image, config)
+        write_exr(folder / "checkpoints.exr", {str(i): c for i, c in enumerate(checkpoints)})
+        write_text(folder / "trace.jsonl", "".join(json.dumps(plain(line), allow_nan=False) + "\n" for line in trace))
+        info = plain({"schema_version": SCHEMA_VERSION, "scene": scene, "method": method, "seed": seed, **info})
+        write_json(folder / "cell.json", info)
+        (folder / "failed.json").unlink(missing_ok=True)
+        return Cell(scene, method, seed, info, trace, folder)
+
+    def write_failure(self, scene: str, method: str, seed: int, reason: str) -> None:
+        """Say why a cell is not complete."""
+        self.remove_cell(scene, method, seed)
+        write_json(self.cell_folder(scene, method, seed) / "failed.json",
+                   {"schema_version": SCHEMA_VERSION, "scene": scene, "method": method, "seed": seed, "reason": reason})
+
+    def remove_cell(self, scene: str, method: str, seed: int) -> None:
+        """Make a cell incomplete, before it is redone: cell.json goes first."""
+        for name in ("cell.json", "image.exr", "checkpoints.exr", "trace.jsonl"):
+            (self.cell_folder(scene, method, seed) / name).unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold a folder (of a cell or a reference) while the body runs, by a file `lock` in it.
+
+    The lock of a process of this host that no longer lives is taken over, and its unfinished files are removed.
+
+    Raises:
+        LockedError: another process holds it.
+    """
+    path = folder / "lock"
+    folder.mkdir(parents=True, exist_ok=True)
+    _acquire(path)
+    try:
+        for left in folder.glob(".*.tmp*"):
+            left.unlink(missing_ok=True)
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _identity() -> dict[str, Any]:
+    import psutil
+    return {"pid": os.getpid(), "host": socket.gethostname(), "started": psutil.Process().create_time()}
+
+
+def _is_stale(owner: dict[str, Any]) -> bool:
+    """The owner was a process of this host and is gone; another process with its number does not count."""
+    import psutil
+    if owner.get("host") != socket.gethostname():
+        return False
+    try:
+        return abs(psutil.Process(int(owner["pid"])).create_time() - float(owner["started"])) > 1
+    except psutil.NoSuchProcess:
+        return True
+    except (KeyError, TypeError, ValueError, psutil.Error):
+        return False
+
+
+def _acquire(path: Path) -> None:
+    identity = json.dumps(_identity())
+    for _ in range(3):
+        try:
+            handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
+        except FileExistsError:
+            try:
+                text = path.read_text()
+                owner = json.loads(text)
+            except FileNotFoundError:                   # released meanwhile
+                continue
+            except ValueError:
+                raise LockedError(f"{path} is held by somebody unknown; delete it if nothing runs") from None
+            if not _is_stale(owner):
+                raise LockedError(f"{path} is held by process {owner.get('pid')} on {owner.get('host')}") from None
+            aside = path.with_name(f".lock.{socket.gethostname()}-{os.getpid()}")
+            try:
+                os.rename(path, aside)                  # one of those who try this succeeds
+            except FileNotFoundError:
+                continue
+            if aside.read_text() != text:       # another was faster, and its new lock was moved: put it back
+                os.link(aside, path)
+            aside.unlink()
+            continue
+        try:
+            os.write(handle, identity.encode())
+        finally:
+            os.close(handle)
+        return
+    raise LockedError(f"{path} is contended")
+
+
+# ---------------------------------------------------------------- references
+
+def find_reference(key: str, folders: list[Path]) -> Path | None:
+    """The first of `folders` (each a `references` folder) that has a reference with this key."""
+    return next((f / key for f in folders if (f / key / "meta.json").exists()), None)
+
+
+def read_reference(path: Path, width: int, height: int) -> Reference:
+    """A reference folder, or an EXR of another renderer, for an image of `width` x `height`.
+
+    A foreign EXR may be larger by a whole factor: its pixels are averaged.
+
+    Raises:
+        ResultError: missing, broken, newer, or of another size.
+    """
+    if path.is_file():
+        parts, _ = read_exr(path)
+        image = next(iter(parts.values()))
+        if image.shape[2] != 3:
+            raise ResultError(f"reference {path} has no RGB image")
+        if not np.isfinite(image).all():
+            raise ResultError(f"reference {path} has pixels that are not finite")
+        image = _shrink(image, width, height, path)
+        unknown = np.full_like(image, np.inf)
+        return Reference(image, image, unknown, unknown, {"estimator": f"{path.name}, of another renderer"})
+    meta = read_json(path / "meta.json")
+    parts, header = read_exr(path / "reference.exr")
+    meta |= header          # of the same moment as the pixels, should the two files differ
+    for name in ("a.mean", "b.mean", "a.variance", "b.variance"):
+        if name not in parts or not np.isfinite(parts[name]).all():
+            raise ResultError(f"{path / 'reference.exr'} is broken: no finite part '{name}'; "
+                              "remove the folder and make it again")
+        if parts[name].shape != (height, width, 3):
+            h, w, _ = parts[name].shape
+            raise ResultError(f"reference {path} is {w}x{h}, the experiment's image is {width}x{height}")
+    return Reference(parts["a.mean"], parts["b.mean"], parts["a.variance"], parts["b.variance"], meta)
+
+
+def _shrink(image: np.ndarray, width: int, height: int, path: Path) -> np.ndarray:
+    h, w, _ = image.shape
+    factor = w // width
+    if factor < 1 or (w, h) != (factor * width, factor * height):
+        raise ResultError(f"reference {path} is {w}x{h}, the experiment's image is {width}x{height}: "
+                          "must be the same, or that times a whole number")
+    return image.reshape(height, factor, width, factor, 3).mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
+
+
+def write_reference(folder: Path, reference: Reference) -> None:
+    """Write a reference, meta.json last."""
+    parts = {"a.mean": reference.a, "b.mean": reference.b,
+             "a.variance": reference.a_variance, "b.variance": reference.b_variance}
+    write_exr(folder / "reference.exr", parts, reference.meta)
+    write_json(folder / "meta.json", {"schema_version": SCHEMA_VERSION, **reference.meta})

@@ -1,0 +1,424 @@
+"""One cell: warm up, train, render until the budget is spent; and an experiment: all its cells, resumable.
+
+What is on the clock: training and rendering, evaluated and synchronised.  What is not: compilation (every kernel is
+compiled before the clock starts, and what was missed is taken off and counted), accumulation, checkpoints, files,
+progress.  Charged seconds are defined in :mod:`olpm_bench.bench.clock`.
+"""
+from __future__ import annotations
+
+import dataclasses
+import math
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from olpm_bench.bench import environment
+from olpm_bench.bench.clock import Clock
+from olpm_bench.bench.config import CellSpec, Experiment
+from olpm_bench.bench.metrics import luminance
+from olpm_bench.bench.progress import Bar, is_interrupt
+from olpm_bench.bench.results import (
+    Accumulator,
+    Cell,
+    LockedError,
+    NewerSchemaError,
+    Reference,
+    ResultError,
+    Results,
+    find_reference,
+    locked,
+    read_reference,
+)
+from olpm_bench.scenes import load as scene_load
+from olpm_bench.transport.guide import Guide
+from olpm_bench.transport.settings import TrainingSettings
+from olpm_bench.transport.training import PassStatistics, train
+
+PASSES = 40                 # rendering passes in a budget, at least: so it is met within 1/40
+SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
+MAX_LANES = 2**24           # paths in flight: about 2 GB
+WARM_UP_PATHS = 20_000      # photons and importons of the training that compiles the kernels
+WAITED = 0.05               # wait fraction from which on a cell is reported
+
+# 32-bit seeds of rendering passes: cells from 0, warm-up from 2^30, reference halves from 2^31 and 3 * 2^30.
+PASSES_PER_SEED = 2**15
+WARM_UP_SEED = 2**30
+
+
+class CellFailedError(Exception):
+    """A cell that was run and cannot be used; the message is the reason."""
+
+
+def pass_seed(seed: int, index: int) -> int:
+    """Seed of rendering pass `index` of a cell: different for every (cell seed, pass), the same for every method."""
+    if index >= PASSES_PER_SEED:
+        raise CellFailedError(f"more than {PASSES_PER_SEED} passes; use a larger image or a smaller budget")
+    return seed * PASSES_PER_SEED + index
+
+
+# ---------------------------------------------------------------- kernels
+
+class Kernels:
+    """What Dr.Jit compiled since last asked."""
+
+    def __init__(self) -> None:
+        self.count, self.seconds = 0, 0.0
+
+    @staticmethod
+    @contextmanager
+    def watched() -> Iterator[Kernels]:
+        """Watch compilation while the body runs."""
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            yield Kernels()
+
+    def compiled(self) -> float:
+        """Seconds in the compiler since the last call; also adds to the totals."""
+        jit = [k for k in dr.kernel_history([dr.KernelType.JIT]) if not k["cache_hit"]]
+        seconds = sum(k["backend_time"] for k in jit) * 1e-3
+        self.count += len(jit)
+        self.seconds += seconds
+        return seconds
+
+
+def make_integrator(spec: CellSpec, guide: Guide | None) -> mi.Integrator:
+    from olpm_bench.transport.path import GuidedPathIntegrator  # whose base class exists once a variant is set
+
+    return GuidedPathIntegrator(spec.integrator, guide)
+
+
+def render_pass(scene: mi.Scene, integrator: mi.Integrator, seed: int, spp: int) -> mi.TensorXf:
+    """One pass, evaluated and finished (h, w, 3)."""
+    image = mi.render(scene, integrator=integrator, seed=seed, spp=spp)  # type: ignore[arg-type]
+    dr.eval(image)
+    dr.sync_thread()
+    return image
+
+
+def to_numpy(image: mi.TensorXf) -> np.ndarray:
+    return np.asarray(image.numpy(), dtype=np.float64)[..., :3]
+
+
+@dataclass(frozen=True)
+class WarmUp:
+    """What compiling a method's kernels on a scene told."""
+    compile_seconds: float
+    spp_seconds: float          # charged time of one sample a pixel, guided by the small training of the warm-up
+
+
+def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> WarmUp:
+    """Compile every kernel of a cell, with fewer particles: kernels depend on the structure and not on sizes."""
+    with Kernels.watched() as kernels:
+        if guide is None and spec.training is not None:
+            small = dataclasses.replace(spec.training, passes=min(spec.training.passes, 2),
+                                        photons=min(spec.training.photons, WARM_UP_PATHS),
+                                        importons=min(spec.training.importons, WARM_UP_PATHS))
+            guide = _train(spec, scene, small, WARM_UP_SEED)
+        integrator = make_integrator(spec, guide)
+        for spp in (1, 2):      # dividing by 1 is a kernel of its own
+            render_pass(scene, integrator, WARM_UP_SEED, spp)
+        kernels.compiled()
+        while True:
+            clock = Clock(count_wait=environment.uses_llvm())
+            with clock.lap("render", kernels.compiled):
+                render_pass(scene, integrator, WARM_UP_SEED, spp)
+            if clock.charged > SHORTEST_PASS / 4 or 4 * spp > largest_pass(spec):
+                return WarmUp(kernels.seconds, max(clock.charged, 1e-6) / spp)
+            spp *= 4
+
+
+def _train(spec: CellSpec, scene: mi.Scene, settings: TrainingSettings, seed: int,
+           on_pass: Callable[[PassStatistics], None] | None = None) -> Guide:
+    assert spec.method.representation is not None
+    guide = train(scene, spec.method.representation, settings, max_depth=spec.integrator.max_depth, seed=seed,
+                  on_pass=on_pass)
+    dr.sync_thread()
+    return guide
+
+
+def largest_pass(spec: CellSpec) -> int:
+    """Samples a pixel that a pass may take for the sake of memory."""
+    return max(1, MAX_LANES // (spec.scene.width * spec.scene.height))
+
+
+def spp_of_pass(spec: CellSpec, warm: WarmUp | None = None) -> int:
+    """Samples a pixel of each rendering pass: by timing for a budget in seconds, else by the experiment's file alone.
+
+    A power of two: Mitsuba divides the lane's index by it, and other divisors make other kernels.
+    """
+    if spec.budget.seconds is None:
+        spp = (spec.budget.spp or 0) / PASSES
+    else:
+        assert warm is not None
+        spp = max(SHORTEST_PASS, spec.budget.seconds / PASSES) / warm.spp_seconds
+    return power_of_two(min(spp, largest_pass(spec)))
+
+
+def power_of_two(n: float) -> int:
+    """The largest power of two <= n, at least 1."""
+    return 1 << max(0, int(n).bit_length() - 1)
+
+
+# ---------------------------------------------------------------- one cell
+
+@dataclass
+class Measurement:
+    """What a cell yields."""
+    info: dict[str, Any]
+    trace: list[dict[str, Any]]
+    image: dict[str, np.ndarray]
+    checkpoints: list[np.ndarray]
+    guide: Guide | None = field(repr=False, default=None)
+
+
+def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None = None,
+            on_progress: Callable[[float, str], None] = lambda done, what: None) -> Measurement:
+    """Train, and render until the budget is spent.  The rule to stop does not look at the image.
+
+    Args:
+        warm: from :func:`warm_up` of this scene and method in this process.
+        guide: use it instead of training one.
+        on_progress: called off the clock (and after each training pass) with the share of the budget spent.
+
+    Raises:
+        CellFailedError: a pixel that is NaN, infinite or negative.
+    """
+    budget, spp = spec.budget, spp_of_pass(spec, warm)
+    clock = Clock(count_wait=environment.uses_llvm())
+    passes: list[dict[str, Any]] = []
+    with Kernels.watched() as kernels:
+        if guide is None and spec.training is not None:
+            def on_pass(statistics: PassStatistics) -> None:
+                passes.append(dataclasses.asdict(statistics))
+                on_progress(0.0, f"training pass {statistics.index + 1} of {statistics.passes}")
+
+            with clock.lap("train", kernels.compiled):
+                guide = _train(spec, scene, spec.training, spec.seed, on_pass)
+
+        integrator = make_integrator(spec, guide)
+        counts = {"records": guide.records if guide else 0, "particles": guide.particles if guide else 0}
+        sum_of, brightness = Accumulator.empty(spec.scene.height, spec.scene.width), Accumulator.empty(1, 1)
+        trace: list[dict[str, Any]] = []
+        checkpoints: list[np.ndarray] = []
+        targets: list[float] | None = None
+        while True:
+            n = spp if budget.spp is None else power_of_two(min(spp, budget.spp - sum_of.spp))
+            seed = pass_seed(spec.seed, sum_of.passes)
+            with clock.lap("render", kernels.compiled):
+                rendered = render_pass(scene, integrator, seed, n)
+            image = to_numpy(rendered)
+            check_pixels(image, seed)
+            sum_of.add(image, n)
+            brightness.add(np.mean(luminance(image)), n)
+
+            spent, limit = (sum_of.spp, budget.spp) if budget.spp is not None else (clock.charged, budget.seconds or 0)
+            if targets is None:
+                targets = checkpoint_times(spent, limit, budget.checkpoints)
+            if spent >= limit or spent >= targets[0]:
+                targets = [t for t in targets if t > spent]
+                total = clock.total
+                trace.append({
+                    "seconds": total.charged, "train_seconds": clock["train"].charged,
+                    "render_seconds": clock["render"].charged, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
+                    "spp": sum_of.spp, **counts})
+                checkpoints.append(sum_of.mean.astype(np.float32))
+            on_progress(min(1.0, spent / limit), f"{sum_of.spp} spp")
+            if spent >= limit:
+                break
+
+    total, stderr = clock.total, math.sqrt(float(brightness.variance()[0, 0, 0]))
+    info = {
+        "key": spec.key, "spp": sum_of.spp, "charged_seconds": total.charged, "train_seconds": clock["train"].charged,
+        "render_seconds": clock["render"].charged, "compile_seconds": warm.compile_seconds + kernels.seconds,
+        "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
+        "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
+        **counts, "bytes_per_record": guide.bytes_per_record if guide is not None else 0, "invalid_pixels": 0,
+        "mean": float(brightness.mean[0, 0, 0]), "mean_stderr": stderr, "pass_spp": spp, "passes": passes,
+    }
+    h, w, _ = sum_of.mean.shape
+    layers = {"mean": sum_of.mean, "variance": sum_of.variance(), "count": np.full((h, w), sum_of.spp, np.float32)}
+    return Measurement(info, trace, {k: v.astype(np.float32) for k, v in layers.items()}, checkpoints, guide)
+
+
+def checkpoint_times(first: float, last: float, n: int) -> list[float]:
+    """Log-spaced times (or sample counts) from the first pass to the end of the budget."""
+    return [float(t) for t in np.geomspace(min(max(first, 1e-3 * last), last), last, n)] if n > 1 else [last]
+
+
+def check_pixels(image: np.ndarray, seed: int) -> None:
+    """
+    Raises:
+        CellFailedError: a pixel of the pass with this seed is NaN, infinite or negative.
+    """
+    invalid = ~(np.isfinite(image) & (image >= 0)).all(axis=-1)
+    if invalid.any():
+        y, x = np.argwhere(invalid)[0]
+        raise CellFailedError(f"{int(invalid.sum())} pixels are NaN, infinite or negative; the first is "
+                              f"x = {x}, y = {y}: {image[y, x].tolist()}, in the pass with seed {seed}")
+
+
+# ---------------------------------------------------------------- an experiment
+
+def load_scene(spec: CellSpec) -> mi.Scene:
+    """The scene of a cell.
+
+    Raises:
+        SceneError: it cannot be used.
+    """
+    s = spec.scene
+    return scene_load.load(s.file or s.name, s.arguments, s.width, s.height, spec.integrator.max_depth)
+
+
+def references(experiment: Experiment, root: Path) -> dict[str, Reference]:
+    """Scene name -> reference, of every scene.
+
+    Args:
+        root: the `--results` folder.
+
+    Raises:
+        ResultError: one is missing or broken; the message names the command that makes it.
+    """
+    found = {}
+    for scene in experiment.scene:
+        key = experiment.reference_key(scene)
+        path = scene.reference or find_reference(key, reference_folders(experiment, root))
+        if path is None:
+            raise ResultError(f"scene {scene.name} has no reference {key}; make it with: "
+                              f"olpm-bench reference {shlex.quote(str(experiment.path))}")
+        found[scene.name] = read_reference(path, scene.width, scene.height)
+    return found
+
+
+def reference_folders(experiment: Experiment, root: Path) -> list[Path]:
+    """Where references are looked for, in this order."""
+    return [root / "references", experiment.path.parent / ".." / "results" / "references"]
+
+
+def run(experiment: Experiment, root: Path) -> list[str]:
+    """Run what is not complete of an experiment; return one line for each cell that is not complete afterwards.
+
+    Raises:
+        ResultError: a reference is missing (nothing was run), or a result is of a newer schema.
+        SceneError, OSError: a scene cannot be used; a file cannot be written.
+    """
+    results = Results(root / experiment.path.stem)
+    references(experiment, root)                            # before hours of work, not after
+    cells = experiment.cells()
+    loaded = {spec.scene.name: load_scene(spec) for spec in {c.scene.name: c for c in cells}.values()}
+    todo, problems = [], []
+    for spec in cells:
+        complete, why = is_complete(results, spec)
+        if not complete:
+            todo.append((spec, why))
+    results.write_text("experiment.toml", experiment.toml(results.folder))
+    results.write_json("env.json", environment.describe())
+
+    warm: dict[tuple[str, str], WarmUp] = {}
+    with Bar(len(todo)) as bar:
+        if len(todo) < len(cells):
+            bar.say(f"{len(cells) - len(todo)} of {len(cells)} cells are complete already")
+        for index, (spec, why) in enumerate(todo):
+            if why:
+                bar.say(f"{spec}: {why}; redone")
+            try:
+                cell = _run_cell(results, spec, loaded[spec.scene.name], warm, bar, index)
+            except (CellFailedError, LockedError) as error:
+                problems.append(f"{spec}: {error}")
+                bar.say(problems[-1])
+                continue
+            if cell is not None:
+                info = cell.info
+                flag = f", waited {info['wait_fraction']:.0%} for busy cores" if info["wait_fraction"] > WAITED else ""
+                bar.say(f"[{index + 1}/{len(todo)}] {spec}: {info['spp']} spp in {info['charged_seconds']:.1f} s, "
+                        f"{info['train_seconds']:.1f} s of it training{flag}")
+    return problems
+
+
+def is_complete(results: Results, spec: CellSpec) -> tuple[bool, str]:
+    """Whether a cell need not be run; if it must be redone, why (empty: it never was complete).
+
+    Raises:
+        NewerSchemaError: written by a later version.
+    """
+    try:
+        cell = results.verified_cell(spec.scene.name, spec.method.name, spec.seed)
+    except NewerSchemaError:
+        raise
+    except ResultError as error:
+        return False, str(error)
+    if cell is None:
+        return False, ""
+    return (True, "") if cell.info.get("key") == spec.key else (False, "made with other settings")
+
+
+def _run_cell(results: Results, spec: CellSpec, scene: mi.Scene, warm: dict[tuple[str, str], WarmUp], bar: Bar,
+              index: int) -> Cell | None:
+    names = spec.scene.name, spec.method.name, spec.seed
+    with locked(results.cell_folder(*names)):
+        if is_complete(results, spec)[0]:       # by another process, meanwhile
+            return None
+        try:
+            pair = names[:2]
+            if pair not in warm:
+                bar.at(index, f"{spec}: compiling")
+                warm[pair] = warm_up(spec, scene)
+            done = measure(spec, scene, warm[pair],
+                           on_progress=lambda share, what: bar.at(index + share, f"{spec}: {what}"))
+        except CellFailedError as error:
+            results.write_failure(*names, str(error))
+            raise
+        except RuntimeError as error:           # of Mitsuba or Dr.Jit: the other cells may still work
+            if is_interrupt(error):
+                raise KeyboardInterrupt from error
+            reason = " ".join(str(error).split())
+            results.write_failure(*names, reason)
+            raise CellFailedError(reason) from error
+        return results.write_cell(*names, done.info, done.trace, done.image, done.checkpoints, spec.config())
+
+
+def plan(experiment: Experiment, root: Path) -> dict[str, Any]:
+    """What a run would do: cells, those to run, hours (None for a budget of samples), gigabytes of memory."""
+    results = Results(root / experiment.path.stem)
+    cells = experiment.cells()
+    todo = [spec for spec in cells if not is_complete(results, spec)[0]]
+    seconds = [spec.budget.seconds for spec in todo]
+    return {"cells": cells, "todo": todo, "hours": sum(s for s in seconds if s) / 3600 if None not in seconds else None,
+            "gigabytes": max((memory(spec) for spec in cells), default=0.0)}
+
+
+def memory(spec: CellSpec) -> float:
+    """Estimate of the memory of a cell [GB]: Mitsuba itself, paths in flight, particles of a pass, images."""
+    pixels = spec.scene.width * spec.scene.height
+    lanes = pixels * (spp_of_pass(spec) if spec.budget.spp is not None else 16)
+    particles = 0
+    if spec.training is not None:
+        single = spec.training.passes if spec.training.schedule == "single_batch" else 1
+        particles = 8 * single * (spec.training.photons + spec.training.importons)        # about 8 hits a path
+    return (300e6 + 120 * lanes + 100 * particles + pixels * 3 * (8 * 4 + 4 * spec.budget.checkpoints)) / 1e9
+
+
+def report(experiment: Experiment, root: Path) -> None:
+    """Summary, table and figures of a complete experiment; the table is printed.
+
+    Raises:
+        ResultError: a cell or a reference is missing.
+    """
+    from olpm_bench.bench import summary
+    from olpm_bench.report import figures, sheet
+
+    results, found = Results(root / experiment.path.stem), references(experiment, root)
+    summarised = summary.summarise(experiment, results, found)
+    summary.write(summarised, results)
+    figures.curves(results, experiment, found)
+    sheet.sheet(results, experiment, found)
+    summary.print_table(summarised)
+    if len(experiment.method) > 1:
+        summary.print_speed_ups(summary.speed_ups(experiment, results, found), experiment.method[0].name)
+    print(f"in {results.folder}: summary.json, table.csv, figure.png, figure.pdf, sheet.png")

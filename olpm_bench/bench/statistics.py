@@ -1,0 +1,169 @@
+"""Spread over seeds, and comparisons between methods: bands, bootstrap intervals, equal error, means of ratios.
+
+Error curves live on log-log axes, where convergence is a straight line of slope -1/2, so they are interpolated
+there, and never beyond what was measured.  Seeds are paired: seed i of one method with seed i of another.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+BAND = (5.0, 95.0)          # [%]
+RESAMPLES = 2000
+
+
+class Band(NamedTuple):
+    """Median and 5 to 95 % range over seeds: floats, or arrays over a common axis."""
+    median: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+class Interval(NamedTuple):
+    """An estimate and its bootstrap interval (90 %), NaN where there is none."""
+    value: float
+    low: float
+    high: float
+    bound: str = ""         # ">": at least the value; "<": at most
+
+
+class Curve(NamedTuple):
+    """Error against time for several seeds on one time axis: times (n), errors (seeds, n)."""
+    times: np.ndarray
+    errors: np.ndarray
+
+    @property
+    def median(self) -> np.ndarray:
+        return np.median(self.errors, axis=0)
+
+
+def median_band(values: Sequence[float] | np.ndarray) -> Band:
+    """Median and 5 to 95 % band over the first axis (seeds)."""
+    low, median, high = np.percentile(np.asarray(values, np.float64), (BAND[0], 50.0, BAND[1]), axis=0)
+    return Band(median, low, high)
+
+
+def geometric_mean(ratios: Sequence[float] | np.ndarray) -> float:
+    """exp(mean(log)): the mean of speed-ups or error ratios over scenes.
+
+    Raises:
+        ValueError: no ratio, or one that is not positive and finite.
+    """
+    ratios = np.asarray(ratios, np.float64)
+    if ratios.size == 0 or not (np.isfinite(ratios).all() and (ratios > 0).all()):
+        raise ValueError(f"ratios {ratios.tolist()}: must be positive and finite, and at least one")
+    return float(np.exp(np.log(ratios).mean()))
+
+
+def interpolate(times: np.ndarray, errors: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Errors at the times `at`, linear on log-log axes; NaN outside the measured times."""
+    return np.exp(np.interp(np.log(at), np.log(times), np.log(errors), left=np.nan, right=np.nan))
+
+
+def common_curve(times: Sequence[np.ndarray], errors: Sequence[np.ndarray], n: int = 65) -> Curve:
+    """Curves of several seeds, each with its own checkpoints, on the geometric axis of times that all of them cover.
+
+    Curves of a single checkpoint each stay as they are, at its median time.
+
+    Args:
+        times, errors: per seed, equally long; times (or samples per pixel) increasing and positive, errors positive.
+        n: points of the axis.
+
+    Raises:
+        ValueError: an input out of that range, or curves without a common time.
+    """
+    for t, e in zip(times, errors, strict=True):
+        if len(t) != len(e) or not (np.diff(t) > 0).all() or not np.min(t) > 0:
+            raise ValueError(f"times {np.asarray(t).tolist()}: must increase from above 0, one per error")
+        if not (np.min(e) > 0 and np.isfinite(e).all()):
+            raise ValueError(f"errors {np.asarray(e).tolist()}: must be positive and finite")
+    if all(len(t) == 1 for t in times):
+        return Curve(np.median(np.asarray(times, np.float64), axis=0), np.asarray(errors, np.float64))
+    start, end = max(t[0] for t in times), min(t[-1] for t in times)
+    if start > end:
+        raise ValueError(f"the seeds' curves share no time: one starts at {start:.3g}, another ends at {end:.3g}")
+    at = np.geomspace(start, end, n)
+    at[0], at[-1] = start, end      # exactly: rounding must not leave the measured range
+    return Curve(at, np.stack([interpolate(t, e, at) for t, e in zip(times, errors, strict=True)]))
+
+
+def time_to_error(times: np.ndarray, errors: np.ndarray, error: float) -> float:
+    """First time at which the curve is down to `error`, by log-log interpolation.
+
+    Returns:
+        NaN where it never is, and where it is already below at its first point: that time was not measured.
+    """
+    if errors[0] < error:
+        return float("nan")
+    reached = np.flatnonzero(errors <= error)
+    if reached.size == 0:
+        return float("nan")
+    i = int(reached[0])
+    if errors[i] == error:
+        return float(times[i])
+    log_t, log_e = np.log(times[i - 1:i + 1]), np.log(errors[i - 1:i + 1])
+    return float(np.exp(np.interp(-np.log(error), -log_e, log_t)))
+
+
+def bootstrap(statistic: Callable[[np.ndarray], float], n: int, seed: int = 0) -> Interval:
+    """Percentile bootstrap of a statistic of seeds, which gets their numbers (n,) and so resamples methods in pairs.
+
+    Returns:
+        The interval is NaN with one seed, and where some resample has no value.
+    """
+    value = float(statistic(np.arange(n)))
+    if n < 2:
+        return Interval(value, float("nan"), float("nan"))
+    drawn = np.random.default_rng(seed).integers(0, n, (RESAMPLES, n))
+    low, high = np.percentile([statistic(index) for index in drawn], BAND)
+    return Interval(value, float(low), float(high))
+
+
+def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Interval:
+    """Time of the baseline over time of the method at equal error (medians), with a paired bootstrap interval.
+
+    Args:
+        error: the error to reach; by default the lowest that both curves reach, found anew in each resample.
+
+    Returns:
+        NaN where one of them does not reach the error, or both start below it.  Where only one starts below, the
+        ratio with its first time bounds the speed-up, and `bound` says from which side.
+    """
+    _paired(baseline, method)
+
+    def ratio(index: np.ndarray) -> tuple[float, str]:
+        a, b = (np.median(curve.errors[index], axis=0) for curve in (baseline, method))
+        level = max(a.min(), b.min()) if error is None else error
+        below = a[0] < level, b[0] < level
+        if all(below):
+            return float("nan"), ""
+        time_a = baseline.times[0] if below[0] else time_to_error(baseline.times, a, level)
+        time_b = method.times[0] if below[1] else time_to_error(method.times, b, level)
+        return float(time_a / time_b), "<" if below[0] else ">" if below[1] else ""
+    interval = bootstrap(lambda index: ratio(index)[0], len(method.errors))
+    return interval._replace(bound=ratio(np.arange(len(method.errors)))[1])
+
+
+def error_ratio(baseline: Curve, method: Curve, seconds: float | None = None) -> Interval:
+    """Error of the baseline over error of the method at equal time (medians), with a paired bootstrap interval.
+
+    Args:
+        seconds: the time; by default the latest that both curves cover.
+
+    Returns:
+        NaN where one of them does not cover the time.
+    """
+    _paired(baseline, method)
+    at = np.array([min(baseline.times[-1], method.times[-1]) if seconds is None else seconds])
+
+    def ratio(index: np.ndarray) -> float:
+        a, b = (interpolate(c.times, np.median(c.errors[index], axis=0), at)[0] for c in (baseline, method))
+        return float(a / b)
+    return bootstrap(ratio, len(method.errors))
+
+
+def _paired(a: Curve, b: Curve) -> None:
+    if len(a.errors) != len(b.errors):
+        raise ValueError(f"{len(a.errors)} and {len(b.errors)} seeds: curves are compared in pairs of seeds")

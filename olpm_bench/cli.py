@@ -1,0 +1,224 @@
+"""The command line.  Sets the variant and turns expected errors into one line and an exit code; nothing else.
+
+Exit codes: 0 all is complete; 1 a cell failed or is missing; 2 bad input; 130 interrupted.
+"""
+from __future__ import annotations
+
+import functools
+import json
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
+                  help="Which learnt directional distribution guides a path tracer best?")
+
+ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", show_default=False)]
+ResultsFolder = Annotated[Path, typer.Option(
+    "--results", metavar="DIR", help="Results go to DIR/<stem of the TOML>, references to DIR/references.")]
+Replacements = Annotated[list[str], typer.Option(
+    "--scene", metavar="NAME=PATH", help="Read the scene NAME of the experiment from another XML.")]
+Assignments = Annotated[list[str], typer.Option(
+    "--set", metavar="TABLE.KEY=VALUE", help="Change a setting; keys as in the TOML.")]
+
+
+def complain(message: str) -> None:
+    print(f"olpm-bench: {' '.join(message.split())}", file=sys.stderr)
+
+
+def command(body: Callable[..., None]) -> Callable[..., None]:
+    """A command of `app` whose expected errors become one line on stderr and an exit code.
+
+    Expected: what the user's files, options and machine can cause.  Anything else is a bug and keeps its traceback.
+    """
+    @functools.wraps(body)
+    def run(*args: Any, **kwargs: Any) -> None:
+        previous = signal.signal(signal.SIGTERM, _interrupt)
+        try:
+            body(*args, **kwargs)
+        except (KeyboardInterrupt, RuntimeError) as error:
+            from olpm_bench.bench.progress import is_interrupt
+            if isinstance(error, typer.Exit) or not is_interrupt(error):
+                raise
+            complain("interrupted; what is complete is kept, and the same command goes on from there")
+            raise typer.Exit(INTERRUPTED) from None
+        except OSError as error:
+            complain(": ".join(str(p) for p in (error.filename, error.strerror or error) if p))
+            raise typer.Exit(BAD_INPUT) from None
+        except (ValueError, ImportError) as error:
+            if isinstance(error, ImportError) and type(error).__name__ != "LLVMError":
+                raise
+            complain(str(error))
+            raise typer.Exit(BAD_INPUT) from None
+        finally:
+            signal.signal(signal.SIGTERM, previous)
+    return app.command(body.__name__.strip("_"))(run)
+
+
+def _interrupt(signum: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _load(path: Path, replacements: list[str] | None = None) -> Any:
+    """The experiment, with `NAME=PATH` options applied."""
+    from olpm_bench.bench import config
+
+    scenes = {}
+    for text in replacements or []:
+        name, equals, file = text.partition("=")
+        if not equals or not name or not file:
+            raise config.ConfigError(f"--scene {text}: must be NAME=PATH")
+        scenes[name] = Path(file)
+    return config.load(path, scenes)
+
+
+@command
+def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
+        dry_run: Annotated[bool, typer.Option("--dry-run", help="Print cells, hours and memory; run nothing.")] = False,
+        ) -> None:
+    """Run an experiment, or what is missing of it; then print its table and draw its figures."""
+    from olpm_bench.bench import environment
+
+    loaded = _load(experiment, scene)
+    environment.select_variant()
+    from olpm_bench.bench import run as runner
+
+    if dry_run:
+        plan = runner.plan(loaded, results)
+        hours = "unknown" if plan["hours"] is None else f"{plan['hours']:.2f}, and compilation"
+        for spec in plan["cells"]:
+            print(f"{spec}{'' if spec in plan['todo'] else '  (complete)'}")
+        print(f"{len(plan['todo'])} of {len(plan['cells'])} cells to run; hours: {hours}; "
+              f"memory: about {plan['gigabytes']:.1f} GB")
+        return
+    problems = runner.run(loaded, results)
+    if problems:
+        for problem in problems:
+            complain(problem)
+        complain(f"{len(problems)} of {len(loaded.cells())} cells are not complete; no table and no figures")
+        raise typer.Exit(FAILED)
+    runner.report(loaded, results)
+
+
+@command
+def reference(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
+              seconds: Annotated[float, typer.Option(min=1.0, help="Charged seconds for each scene.")] = 300.0) -> None:
+    """Make or improve the references of an experiment: two unguided halves, resumable."""
+    from olpm_bench.bench import environment
+
+    loaded = _load(experiment, scene)
+    environment.select_variant()
+    from olpm_bench.bench import reference as references
+    from olpm_bench.bench.run import CellFailedError
+
+    try:
+        references.improve(loaded, results, seconds)
+    except CellFailedError as error:
+        complain(str(error))
+        raise typer.Exit(FAILED) from None
+
+
+@command
+def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedded scene, or a Mitsuba XML.",
+                                                show_default=False)],
+           method: Annotated[str, typer.Option(metavar="unguided|REPRESENTATION", show_default=False)],
+           out: Annotated[Path, typer.Option(metavar="FILE.exr", show_default=False)],
+           set_: Assignments = [],  # noqa: B006
+           seconds: Annotated[float | None, typer.Option(help="Charged seconds, training included.")] = None,
+           spp: Annotated[int | None, typer.Option(help="Samples per pixel; repeats bit for bit.")] = None,
+           width: int = 320, height: int = 180, max_depth: int | None = None, seed: int = 0,
+           threads: Annotated[int | None, typer.Option(help="Threads; all cores by default.")] = None,
+           save_guide: Annotated[Path | None, typer.Option(metavar="FILE.npz", show_default=False)] = None,
+           load_guide: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="Use this guide; train none.",
+                                                           show_default=False)] = None,
+           ) -> None:
+    """Render one image; the last line printed is one JSON object."""
+    from olpm_bench.bench import environment
+
+    if save_guide is not None and load_guide is not None:
+        raise ValueError("give either --save-guide or --load-guide")
+    environment.select_variant(threads)
+    from olpm_bench.bench import render_one
+    from olpm_bench.bench.results import plain
+    from olpm_bench.bench.run import CellFailedError
+
+    spec = render_one.cell(scene, method, set_, seconds=seconds, spp=spp, width=width, height=height,
+                           max_depth=max_depth, seed=seed)
+    try:
+        done = render_one.render(spec, out, save_guide=save_guide, load_guide=load_guide)
+    except CellFailedError as error:
+        complain(str(error))
+        raise typer.Exit(FAILED) from None
+    print(json.dumps(plain(done), allow_nan=False))
+
+
+@command
+def fit(representation: Annotated[str, typer.Option(metavar="NAME", show_default=False)],
+        samples: Annotated[Path, typer.Option(metavar="S.npz", show_default=False)],
+        heldout: Annotated[Path, typer.Option(metavar="H.npz", show_default=False)],
+        set_: Assignments = [],  # noqa: B006
+        batches: Annotated[int, typer.Option(min=1)] = 1, seed: int = 0) -> None:
+    """Train a representation on directional data; prints one JSON object."""
+    from olpm_bench.bench import environment
+
+    environment.select_variant()
+    import representations
+    from olpm_bench.bench import fit as fitting
+    from olpm_bench.bench.render_one import settings
+    from olpm_bench.bench.results import plain
+
+    created = representations.create(representation, **settings(set_, ("representation",))["representation"])
+    print(json.dumps(plain(fitting.fit(created, samples, heldout, batches, seed)), allow_nan=False))
+
+
+@command
+def perf() -> None:
+    """Measure what the targets are about; prints one JSON object."""
+    from olpm_bench.bench import environment
+
+    environment.select_variant()
+    from olpm_bench.bench import perf as performance
+    from olpm_bench.bench.results import plain
+
+    print(json.dumps(plain(performance.measure()), allow_nan=False))
+
+
+@command
+def list_() -> None:
+    """Show scenes, representations and experiments."""
+    import tomllib
+
+    import representations
+    from olpm_bench import scenes
+
+    print("Scenes")
+    for name, description in scenes.names().items():
+        given = ", ".join(f"{k} = {v}" for k, v in scenes.parameters(name).items())
+        print(f"  {name}: {description}{f'  ({given})' if given else ''}")
+    print("  or any Mitsuba XML\nRepresentations")
+    for name in representations.names():
+        print(f"  {name}")
+    print("  or path/to/file.py:ClassName\nExperiments")
+    files = sorted(Path("experiments").glob("*.toml"))
+    for file in files:
+        try:
+            title = tomllib.loads(file.read_text(encoding="utf-8")).get("title", "")
+        except (OSError, ValueError) as error:
+            title = f"cannot be read: {error}"
+        print(f"  {file}: {title}")
+    if not files:
+        print("  none in ./experiments")
+
+
+def main() -> None:
+    app()
+
+
+if __name__ == "__main__":
+    main()

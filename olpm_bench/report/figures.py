@@ -1,0 +1,329 @@
+"""The convergence figure: L1 error over charged seconds, one panel a scene.
+
+Reads results, renders nothing.  Colour, marker and dash belong to a method by its place in the TOML.
+"""
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from olpm_bench.bench import statistics, summary
+from olpm_bench.bench.results import Reference, Results, read_json, replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from olpm_bench.bench.config import Experiment
+
+STYLE = Path(__file__).with_name("olpm_bench.mplstyle")
+GREY = "#8a8a8a"
+PLAIN: dict[str, Any] = {"marker": "none", "linestyle": "-"}
+NEAR_FLOOR = 2.0                # errors below this many noise floors are the reference's own: drawn faintly
+PANEL = (2.75, 2.05)            # width, height of a panel's axes [inch]
+COLUMNS = 2                     # panels side by side
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What one panel shows.
+
+    curves: method -> error of every seed over the abscissa.
+    training: method -> where its training ends on the abscissa; methods without training are left out.
+    budget: where the cells were to stop.
+    floor: noise floor of the reference, mean |A - B| / 2; 0 if unknown.
+    """
+    title: str
+    curves: dict[str, statistics.Curve]
+    training: dict[str, float]
+    budget: float
+    floor: float
+
+
+def curves(results: Results, experiment: Experiment, references: Mapping[str, Reference],
+           out: Path | None = None) -> None:
+    """Write figure.png and figure.pdf into `out` (the results folder by default).
+
+    A budget in samples puts samples per pixel on the abscissa, one in seconds charged seconds.
+
+    Raises:
+        ResultError: a cell or reference is missing; the message names the command that makes it.
+    """
+    over = "seconds" if experiment.budget.spp is None else "spp"
+    cells = summary.complete_cells(experiment, results)
+    panels = []
+    for scene in (scene.name for scene in experiment.scene):
+        reference = summary.scene_reference(references, scene, results, experiment)
+        methods = {method.name: cells[scene, method.name] for method in experiment.method}
+        trained = {method: float(np.median([cell.trace[0]["train_seconds"] for cell in group]))
+                   for method, group in methods.items()}
+        panels.append(Panel(
+            title=scene if len(experiment.scene) > 1 else experiment.title,
+            curves={method: summary.error_curve(group, reference, over=over) for method, group in methods.items()},
+            training={method: t for method, t in trained.items() if t > 0} if over == "seconds" else {},
+            budget=experiment.budget.seconds or experiment.budget.spp or 0,
+            floor=reference.noise_floor or 0.0))
+    faint = any((curve.median < NEAR_FLOOR * panel.floor).any() for panel in panels for curve in panel.curves.values())
+    note = caption(experiment, read_json(results.folder / "env.json"), faint)
+    with style():
+        figure = draw(panels, "time [s], training included" if over == "seconds" else "samples per pixel",
+                      experiment.title if len(panels) > 1 else "", note)
+        save(figure, out or results.folder)
+
+
+def style() -> AbstractContextManager[None]:
+    """The style of our figures; holds for drawing and for saving."""
+    import matplotlib.style
+
+    return matplotlib.style.context(STYLE)
+
+
+def save(figure: Figure, folder: Path) -> None:
+    """Write figure.png and figure.pdf."""
+    with replacing(folder / "figure.png") as beside:
+        figure.savefig(beside)
+    with replacing(folder / "figure.pdf") as beside:
+        figure.savefig(beside, metadata={"CreationDate": None})
+
+
+def caption(experiment: Experiment, environment: Mapping[str, Any], faint: bool = False) -> str:
+    """What every figure must say: seeds, spread, whether training counts, and the machine.
+
+    Args:
+        faint: some curve comes near the noise floor.
+    """
+    n = len(experiment.seeds)
+    seeds = f"Median and 5\N{EN DASH}95 % band of {n} seeds." if n > 1 else "One seed."
+    training = " Time includes training; triangles mark its end." if experiment.budget.spp is None else ""
+    near = f" Faint: below {NEAR_FLOOR:g} times the noise of the reference." if faint else ""
+    return f"{seeds}{training}{near} {machine(environment)}"
+
+
+def machine(environment: Mapping[str, Any]) -> str:
+    """The machine, as env.json describes it."""
+    return f"{environment['cpu']}, {environment['threads']} threads."
+
+
+def draw(panels: Sequence[Panel], abscissa: str, title: str = "", note: str = "") -> Figure:
+    """The figure, in the style that is active.
+
+    Args:
+        abscissa: label of the x axis; title: above all panels; note: caption below them.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    subplots = [figure.add_axes((0, 0, 1, 1), label=str(i)) for i in range(len(panels))]
+    for axes, panel in zip(subplots, panels, strict=True):
+        _draw_panel(axes, panel)
+        axes.set_xlabel(abscissa)
+    columns = min(COLUMNS, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    numbers = [label.get_text() for axes in subplots for label in axes.get_yticklabels()]
+    left = 0.32 + max(_text_width(text, 7.5) for text in numbers)
+    right = 0.28 + 1.03 * max(_text_width(method, 8) for panel in panels for method in panel.curves)
+    bottom, top = 0.42, 0.28
+    width = columns * (left + PANEL[0] + right)
+    lines = textwrap.wrap(note, width=int((width - left) * 21))
+    head, foot = 0.28 if title else 0.0, 0.06 + 0.115 * len(lines)
+    height = head + rows * (top + PANEL[1] + bottom) + foot
+    figure.set_size_inches(width, height)
+    for i, axes in enumerate(subplots):
+        row, column = divmod(i, columns)
+        x = left + column * (left + PANEL[0] + right)
+        y = height - head - row * (top + PANEL[1] + bottom) - top - PANEL[1]
+        axes.set_position((x / width, y / height, PANEL[0] / width, PANEL[1] / height))
+        if column == 0:
+            axes.set_ylabel("L1 error")
+            axes.yaxis.set_label_coords(-(left - 0.18) / PANEL[0], 0.5)
+    if title:
+        figure.text(0.5, 1 - 0.08 / height, title, ha="center", va="top", fontsize=10.5)
+    figure.text(left / width, 0.04 / height, "\n".join(lines), ha="left", va="bottom", fontsize=6.5, color="#555555",
+                linespacing=1.2)
+    return figure
+
+
+def _text_width(text: str, size: float) -> float:
+    """Width [inch] of a text of `size` points."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    return float(TextPath((0, 0), text, size=size, prop=FontProperties(family="STIXGeneral")).get_extents().width) / 72
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    from matplotlib import rcParams
+
+    styles = dict(zip(panel.curves, rcParams["axes.prop_cycle"](), strict=False))
+    axes.set_title(panel.title)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    _limits(axes, panel)
+    for method, curve in panel.curves.items():
+        _draw_curve(axes, curve, styles[method], panel.floor)
+    _draw_floor(axes, panel)
+    _draw_slope(axes, panel)
+    _draw_training(axes, panel.training, styles)
+    _draw_labels(axes, panel.curves, styles)
+
+
+def _limits(axes: Axes, panel: Panel) -> None:
+    """Axes that hold curves, training and, where it isn't far below, the noise floor; with ticks at round numbers."""
+    bands = [statistics.median_band(curve.errors) for curve in panel.curves.values()]
+    starts = [curve.times[0] for curve in panel.curves.values()] + list(panel.training.values())
+    x_low, x_high = min(starts), max(panel.budget, *(curve.times[-1] for curve in panel.curves.values()))
+    y_low, y_high = min(band.low.min() for band in bands), max(band.high.max() for band in bands)
+    if panel.floor > y_low / 4:
+        y_low = min(y_low, panel.floor)
+    x_low, x_high = _padded(x_low, x_high, 0.035)
+    y_low, y_high = _padded(y_low, y_high, 0.1)
+    axes.set_xlim(x_low, x_high)
+    axes.set_ylim(y_low, y_high)
+    for axis, positions in ((axes.xaxis, ticks(x_low, x_high, panel.budget)), (axes.yaxis, ticks(y_low, y_high))):
+        axis.set_ticks(positions, [tick_label(position) for position in positions])
+        axis.set_ticks([], minor=True)
+
+
+def _padded(low: float, high: float, share: float) -> tuple[float, float]:
+    """A range widened by a share of its logarithmic length, which is at least that of a factor of 2."""
+    pad = share * max(math.log(high / low), math.log(2))
+    if high / low < 2:
+        pad = max(pad, (math.log(2) - math.log(high / low)) / 2)
+    return low * math.exp(-pad), high * math.exp(pad)
+
+
+def ticks(low: float, high: float, end: float | None = None) -> list[float]:
+    """Round numbers from `low` to `high` for a logarithmic axis, at least three; and `end`, in place of near ones."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    for ladder in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), np.arange(1, 10, 0.5), np.arange(1, 10, 0.2)):
+        found = [float(f"{m:g}e{d}") for d in decades for m in ladder if low <= float(f"{m:g}e{d}") <= high]
+        if len(found) >= 3:
+            break
+    if end is not None:
+        room = (high / low) ** 0.08
+        found = [tick for tick in found if not end / room < tick < end * room] + [end]
+    return found
+
+
+def tick_label(value: float) -> str:
+    """Plain decimals where they are short, else a power of ten."""
+    if 1e-4 <= value < 1e5:
+        return f"{value:.10g}"
+    mantissa, exponent = f"{value:.2e}".split("e")
+    factor = "" if float(mantissa) == 1 else rf"{float(mantissa):g}\cdot "
+    return rf"${factor}10^{{{int(exponent)}}}$"
+
+
+def _draw_curve(axes: Axes, curve: statistics.Curve, style: Mapping[str, Any], floor: float) -> None:
+    band = statistics.median_band(curve.errors)
+    near = band.median < NEAR_FLOOR * floor
+    axes.fill_between(curve.times, band.low, band.high, color=style["color"], alpha=0.17, linewidth=0)
+    if near.any():
+        axes.plot(curve.times, band.median, **{**style, **PLAIN}, linewidth=0.6, alpha=0.5)
+    if len(curve.times) == 1:
+        axes.vlines(curve.times, band.low, band.high, color=style["color"], linewidth=0.8)
+    clear = np.where(near, np.nan, band.median)
+    step = max(1, (len(curve.times) - 1) // 8)
+    axes.plot(curve.times, clear, **{**style, "marker": "none"})
+    axes.plot(curve.times[::step], clear[::step], **{**style, "linestyle": "none"}, zorder=3)
+
+
+def _draw_floor(axes: Axes, panel: Panel) -> None:
+    low = axes.get_ylim()[0]
+    lowest = min(curve.errors.min() for curve in panel.curves.values())
+    if panel.floor >= low:
+        axes.axhline(panel.floor, color=GREY, linestyle=(0, (1, 1.6)), linewidth=0.9, zorder=1)
+    if lowest < panel.floor:            # a poor reference: the curves are below its line
+        _note(axes, "noise of the reference", (0, panel.floor), (4, 2), ha="left", va="bottom")
+    elif panel.floor >= low:
+        _note(axes, "noise of the reference", (1, panel.floor), (-2, -2), ha="right", va="top")
+    elif panel.floor > 0:
+        text = f"noise of the reference: {tick_label(float(f'{panel.floor:.2g}'))} \N{DOWNWARDS ARROW}"
+        _note(axes, text, (1, low), (-2, 2), ha="right", va="bottom")
+
+
+def _note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **alignment: Any) -> None:
+    axes.annotate(text, at, xycoords=("axes fraction", "data"), xytext=offset, textcoords="offset points", fontsize=6.5,
+                  color=GREY, **alignment)
+
+
+def _draw_training(axes: Axes, training: Mapping[str, float], styles: Mapping[str, Mapping[str, Any]]) -> None:
+    """A triangle on the time axis where each method's training ends; near ones are stacked."""
+    low, high = np.log(axes.get_xlim())
+    placed: list[tuple[float, int]] = []
+    for method, seconds in sorted(training.items(), key=lambda item: item[1]):
+        x = (math.log(seconds) - low) / (high - low)
+        level = 0
+        while any(abs(x - other) < 0.03 and level == taken for other, taken in placed):
+            level += 1
+        placed.append((x, level))
+        axes.plot(x, 0.018 + 0.032 * level, marker="^", linestyle="none", markersize=4.5, color=styles[method]["color"],
+                  transform=axes.transAxes, clip_on=False, zorder=5)
+
+
+def _draw_labels(axes: Axes, curves: Mapping[str, statistics.Curve], styles: Mapping[str, Mapping[str, Any]]) -> None:
+    """Method names at the ends of their curves, moved apart where they would overlap."""
+    points = [axes.transAxes.inverted().transform(axes.transData.transform((curve.times[-1], curve.median[-1])))
+              for curve in curves.values()]
+    heights = spread([float(y) for _, y in points], gap=10 / 72 / PANEL[1])
+    for (method, style), (x, y), label_y in zip(styles.items(), points, heights, strict=False):
+        axes.plot([x, 1.02, 1.035], [y, label_y, label_y], **{**style, **PLAIN}, linewidth=0.6, alpha=0.7,
+                  transform=axes.transAxes, clip_on=False, zorder=1)
+        axes.plot(1.05, label_y, **style, transform=axes.transAxes, clip_on=False)
+        axes.text(1.07, label_y, method, color=style["color"], transform=axes.transAxes, va="center_baseline")
+
+
+def spread(positions: Sequence[float], gap: float) -> list[float]:
+    """Positions moved apart to at least `gap`, in their order, as little as least squares allows."""
+    order = sorted(range(len(positions)), key=lambda i: positions[i])
+    blocks: list[list[float]] = []      # [sum of wanted starts, count]: pool adjacent violators
+    for rank, i in enumerate(order):
+        blocks.append([positions[i] - rank * gap, 1])
+        while len(blocks) > 1 and blocks[-2][0] / blocks[-2][1] > blocks[-1][0] / blocks[-1][1]:
+            total, count = blocks.pop()
+            blocks[-1][0] += total
+            blocks[-1][1] += count
+    starts = [total / count for total, count in blocks for _ in range(int(count))]
+    moved = [0.0] * len(positions)
+    for rank, (i, start) in enumerate(zip(order, starts, strict=True)):
+        moved[i] = start + rank * gap
+    return moved
+
+
+def _draw_slope(axes: Axes, panel: Panel) -> None:
+    """A short line of slope -1/2, the rate of Monte Carlo, where the panel is emptiest."""
+    (x_low, x_high), (y_low, y_high) = np.log(axes.get_xlim()), np.log(axes.get_ylim())
+    fall = 0.5 * (x_high - x_low) / (y_high - y_low)        # of the slope, in axes units
+    length = min(0.3, 0.4 / fall)
+    occupied = []
+    for curve in panel.curves.values():
+        band = statistics.median_band(curve.errors)
+        x = (np.log(curve.times) - x_low) / (x_high - x_low)
+        occupied += [np.column_stack([x, (np.log(y) - y_low) / (y_high - y_low)]) for y in band]
+    if panel.floor > 0:
+        y = max((math.log(panel.floor) - y_low) / (y_high - y_low), 0.06)
+        occupied.append(np.column_stack([np.linspace(0, 1, 40), np.full(40, y)]))
+    points = np.concatenate(occupied)
+    along = np.linspace(0, length, 12)
+    best, where = -1.0, (0.0, 0.0)
+    for x in np.linspace(0.04, 0.96 - length, 24):
+        for y in np.linspace(0.96, 0.06 + fall * length, 24):
+            line = np.column_stack([x + along, y - fall * along + 0.02])       # and its label above it
+            distance = float(np.min(np.hypot((points[:, None, 0] - line[:, 0]) * PANEL[0],
+                                             (points[:, None, 1] - line[:, 1]) * PANEL[1])))
+            distance = min(distance, 0.3)       # [inch]; further away is no better: the first found is high and left
+            if distance > best:
+                best, where = distance, (float(x), float(y))
+    x, y = where
+    axes.plot([x, x + length], [y, y - fall * length], color=GREY, **PLAIN, linewidth=0.8,
+              transform=axes.transAxes, zorder=1)
+    angle = -math.degrees(math.atan2(fall * length * PANEL[1], length * PANEL[0]))
+    axes.text(x + length / 2, y - fall * length / 2, "slope \N{MINUS SIGN}1/2", rotation=angle, rotation_mode="anchor",
+              ha="center", va="bottom", fontsize=6.5, color=GREY, transform=axes.transAxes)

@@ -1,0 +1,153 @@
+"""The embedded scenes, and what identifies a scene.
+
+    >>> from olpm_bench import scenes
+    >>> scenes.parameters("door_ajar")
+    {'gap': 0.07, 'rotation': 23.7, 'floor_roughness': 0.12}
+
+Each embedded scene is a module of this package whose ``build(**parameters)`` returns a dictionary for
+``mi.load_dict``; its first docstring line is its description, and its ``VERSION`` grows when the image changes.
+A new one is a file and a word in ``EMBEDDED``.  Nothing here loads Mitsuba: :mod:`olpm_bench.scenes.load` does.
+"""
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+import json
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.etree import ElementTree
+
+EMBEDDED = ("door_ajar", "cornell_box")
+
+
+class SceneError(ValueError):
+    """A scene that cannot be used; the message is one line: which thing, which value, what is allowed."""
+
+
+def names() -> dict[str, str]:
+    """Every embedded scene with its one-line description."""
+    return {name: (_module(name).__doc__ or "").partition("\n")[0] for name in EMBEDDED}
+
+
+def parameters(name: str) -> dict[str, Any]:
+    """The parameters of an embedded scene with their defaults; ``build`` documents them.
+
+    Raises:
+        SceneError: no such scene.
+    """
+    return {p.name: p.default for p in inspect.signature(_module(name).build).parameters.values()}
+
+
+def resolve(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The parameters of an embedded scene with some changed, every default written out; `build` checks the values.
+
+    Raises:
+        SceneError: no such scene, a parameter it has not, or a value that is no number.
+    """
+    known = parameters(name)
+    for key, value in (changes or {}).items():
+        if key not in known:
+            raise SceneError(f"scene '{name}' has no parameter '{key}'; known: {', '.join(known) or 'none'}")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise SceneError(f"scene '{name}', parameter {key} = {value!r}: must be a number")
+    return {key: float((changes or {}).get(key, default)) for key, default in known.items()}
+
+
+def build(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The dictionary of an embedded scene, for ``mi.load_dict``.  Needs a variant.
+
+    Raises:
+        SceneError: no such scene, a parameter it has not, or a value out of its range.
+    """
+    return _module(name).build(**resolve(name, changes))
+
+
+def is_file(name_or_path: str | Path) -> bool:
+    """Whether this names a file rather than an embedded scene: it is a path, ends in .xml or holds a separator."""
+    return isinstance(name_or_path, Path) or re.search(r"[/\\]|\.xml$", name_or_path, re.IGNORECASE) is not None
+
+
+def digest(name_or_path: str | Path, changes: dict[str, Any] | None = None) -> str:
+    """SHA-256 [hex] of all that determines a scene, but for the sensor's size and path depth.
+
+    Embedded: name, version and every parameter.  File: contents of the XML and of the XML files it includes, name
+    and size of the other files it refers to, and the overrides; where the file lies does not matter.
+
+    Raises:
+        SceneError: no such scene or file, a parameter that the embedded scene has not, or a file that is not XML.
+    """
+    if is_file(name_or_path):
+        path = Path(name_or_path)
+        overrides = {key: str(value) for key, value in (changes or {}).items()}
+        content = {"overrides": overrides, "files": _file_content(path, overrides)}
+    else:
+        name = str(name_or_path)
+        content = {"scene": name, "version": _module(name).VERSION, "parameters": resolve(name, changes)}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """The root element of an XML file.
+
+    Raises:
+        SceneError: a missing or unreadable file, or one that is not XML.
+    """
+    if not path.is_file():
+        raise SceneError(f"scene file {path}: there is no such file")
+    try:
+        return ElementTree.parse(path).getroot()
+    except OSError as error:
+        raise SceneError(f"scene file {path}: {error.strerror}") from error
+    except (ElementTree.ParseError, ValueError) as error:
+        raise SceneError(f"scene file {path} is not well-formed XML: {error}") from error
+
+
+def with_includes(path: Path, overrides: dict[str, str]) -> dict[Path, ElementTree.Element]:
+    """A scene file and all files it includes, with their root elements.
+
+    Raises:
+        SceneError: one of them is missing or not XML.
+    """
+    found: dict[Path, ElementTree.Element] = {}
+    queue = [path]
+    while queue:
+        file = queue.pop(0)
+        if file not in found:
+            found[file] = read_xml(file)
+            values = {**xml_parameters(found), **overrides}
+            queue += [path.parent / substitute(e.get("filename", ""), values) for e in found[file].iter("include")]
+    return found
+
+
+def xml_parameters(files: dict[Path, ElementTree.Element]) -> dict[str, str]:
+    """The parameters of scene files: name -> value of ``<default>``, "" where a `$name` has none."""
+    elements = [e for root in files.values() for e in root.iter()]
+    used = {name: "" for e in elements for text in e.attrib.values() for name in re.findall(r"\$\{?(\w+)", text)}
+    return {**used, **{e.get("name", ""): e.get("value", "") for e in elements if e.tag == "default"}}
+
+
+def substitute(text: str, values: dict[str, str]) -> str:
+    """`text` with its `$name` replaced."""
+    return re.sub(r"\$\{?(\w+)\}?", lambda m: values.get(m[1], m[0]), text)
+
+
+def _file_content(path: Path, overrides: dict[str, str]) -> list[list[Any]]:
+    """[name, hash of an XML file | size of another file (None: missing)] of `path` and of all files it refers to."""
+    files = with_includes(path, overrides)
+    values = {**xml_parameters(files), **overrides}
+    content: list[list[Any]] = [[f.name, hashlib.sha256(f.read_bytes()).hexdigest()] for f in files]
+    for element in (e for root in files.values() for e in root.iter("string")):
+        name = substitute(element.get("value", ""), values)
+        file = path.parent / name
+        if element.get("name") == "filename" or ("." in name and file.is_file()):
+            content.append([name, file.stat().st_size if file.is_file() else None])
+    return content
+
+
+def _module(name: str) -> ModuleType:
+    if name not in EMBEDDED:
+        raise SceneError(f"unknown scene '{name}'; known: {', '.join(EMBEDDED)}, or the path of a Mitsuba XML file")
+    return importlib.import_module(f"{__name__}.{name}")

@@ -1,0 +1,161 @@
+"""Bring particles to the records that learn from them.
+
+Two ways, both deterministic:
+
+* `binned`: a particle goes to the record that its own look-up finds; of more than `neighbours`, evenly spaced ones
+  are kept and stand for the others.  One sort, O(1) a particle.
+* `nearest`: each record takes exactly the `neighbours` nearest particles within its radius, as in the paper [L].
+  Exact to a 2^-24 part of the squared radius; equals are taken in the order of tracing.
+"""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from olpm_bench.transport.cache import Grid, RecordCache
+from olpm_bench.transport.particles import Particles
+from representations.interface import ParticleBatch, group
+
+MIN_ELEVATION = 1e-3        # dot(d, n): particles that graze the record's horizon are left out [L]
+MIN_COSINE = 0.707          # dot(n', n): and those on surfaces that turn away from it [L]
+DIGIT_BITS, DIGITS = 8, 3   # of the squared distances, for selection by radix
+
+
+def binned(cache: RecordCache, particles: Particles, neighbours: int) -> ParticleBatch:
+    """The particles that fall to each record, at most `neighbours` a record."""
+    p, weight, d, _, n = particles.read(particles.place)
+    record, normal, valid = cache.lookup(p, n, weight > 0)
+    valid &= dr.dot(d, normal) >= MIN_ELEVATION
+    order, record, offset = group(dr.select(valid, record, dr.opaque(mi.UInt32, len(cache))), len(cache))
+    # Of the `found` particles of a record, `kept` evenly spaced ones: where rank * kept steps over a multiple of found.
+    found = dr.maximum(dr.gather(mi.UInt32, offset, record + 1) - dr.gather(mi.UInt32, offset, record), 1)
+    kept = dr.minimum(found, dr.opaque(mi.UInt32, neighbours))
+    rank = mi.UInt64(dr.arange(mi.UInt32, len(order)) - dr.gather(mi.UInt32, offset, record))
+    chosen = dr.compress(rank * kept % found < kept)
+    stands_for = dr.gather(mi.Float, mi.Float(found) / mi.Float(kept), chosen)
+    place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, order, chosen))
+    return _batch(cache, particles, place, dr.gather(mi.UInt32, record, chosen), stands_for)
+
+
+def nearest(cache: RecordCache, particles: Particles, neighbours: int) -> ParticleBatch:
+    """Exactly the `neighbours` nearest particles of each record, within its radius."""
+    candidates = _Candidates(cache, particles)
+    # The squared distance of the last neighbour, digit by digit from the highest: counters tell which digit holds it.
+    last, wanted = dr.zeros(mi.UInt32, len(cache)), dr.full(mi.UInt32, neighbours, len(cache))
+    for digit in reversed(range(DIGITS)):
+        shift = dr.opaque(mi.UInt32, digit * DIGIT_BITS)
+        value, wanted = _select_digit(candidates.count_digits(last, shift), wanted)
+        last |= value << shift
+        dr.eval(last, wanted)
+    hit, record = candidates.take(last, wanted, neighbours)
+    by_path = dr.argsort(hit)               # not by voxel: see Particles
+    order, record, _ = group(dr.gather(mi.UInt32, record, by_path), len(cache))
+    place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, hit, dr.gather(mi.UInt32, by_path, order)))
+    return _batch(cache, particles, place, record, mi.Float(1))
+
+
+GATHERS = {"binned": binned, "nearest": nearest}
+
+
+def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: mi.UInt32, stands_for: mi.Float) -> ParticleBatch:
+    """A batch of chosen particles, already grouped by record, with directions in the records' frames."""
+    _, weight, d, distance, _ = particles.read(place)
+    frame = mi.Frame3f(cache.row(record)[1])
+    count = dr.zeros(mi.UInt32, len(cache) + 1)
+    dr.scatter_add(count, mi.UInt32(1), record)
+    batch = ParticleBatch(frame.to_local(d), weight * stands_for, distance, record, dr.prefix_sum(count))
+    dr.eval(batch)
+    return batch
+
+
+class _Candidates:
+    """Particles sorted by voxel (of one radius), and the records that look for theirs in the 27 voxels around them.
+
+    Three voxels that follow one another along x hold one run of particles: nine runs a record.
+    """
+
+    def __init__(self, cache: RecordCache, particles: Particles) -> None:
+        p, weight, d, _, n = particles.read(particles.place)
+        grid = Grid.over(cache.bbox, cache.radius)
+        n_voxels = grid.n_cells // 6
+        order, _, self.offset = group(dr.select(weight > 0, grid.voxel(p), dr.opaque(mi.UInt32, n_voxels)), n_voxels)
+        self.hit = order
+        self.p, self.d, self.n = (dr.gather(type(v), v, order) for v in (p, d, n))
+        self.grid, self.n_records = grid, len(cache)
+        self.record_p, self.record_n, _ = cache.row(dr.arange(mi.UInt32, len(cache)))
+        self.to_key = dr.opaque(mi.Float, 2 ** (DIGIT_BITS * DIGITS) / cache.radius ** 2)
+        dr.eval(self.offset, self.hit, self.p, self.d, self.n, self.record_p, self.record_n)
+
+    def run(self, i: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """First and last + 1 particle of the i-th of the nine runs around each record."""
+        size = mi.Vector3i(self.grid.size)
+        x = mi.Vector3i(self.grid.coordinates(self.record_p))
+        y, z = x.y + mi.Int32(i % 3) - 1, x.z + mi.Int32(i // 3) - 1
+        inside = (y >= 0) & (y < size.y) & (z >= 0) & (z < size.z)
+        row = size.x * (y + size.y * z)
+        first = mi.UInt32(row + dr.maximum(x.x - 1, 0))
+        last = mi.UInt32(row + dr.minimum(x.x + 1, size.x - 1))
+        return dr.gather(mi.UInt32, self.offset, first, inside), dr.gather(mi.UInt32, self.offset, last + 1, inside)
+
+    def key(self, i: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """Squared distance of particle i from the record, as an integer, and whether the record may use it."""
+        d2 = dr.squared_norm(dr.gather(mi.Point3f, self.p, i, active) - self.record_p) * self.to_key
+        ok = active & (d2 < 2 ** (DIGIT_BITS * DIGITS))
+        ok &= dr.dot(dr.gather(mi.Vector3f, self.d, i, ok), self.record_n) >= MIN_ELEVATION
+        ok &= dr.dot(dr.gather(mi.Normal3f, self.n, i, ok), self.record_n) >= MIN_COSINE
+        return mi.UInt32(d2), ok
+
+    @dr.syntax
+    def count_digits(self, last: mi.UInt32, shift: mi.UInt32) -> mi.UInt32:
+        """How often each digit occurs among a record's keys that agree with `last` above it [n_records << DIGIT_BITS]."""
+        counters = dr.zeros(mi.UInt32, self.n_records << DIGIT_BITS)
+        record = dr.arange(mi.UInt32, self.n_records)
+        run = mi.UInt32(0)
+        while run < 9:
+            i, end = self.run(run)
+            while i < end:
+                key, ok = self.key(i, True)
+                above = ((key ^ last) >> shift) >> DIGIT_BITS == 0
+                digit = (key >> shift) & ((1 << DIGIT_BITS) - 1)
+                dr.scatter_add(counters, mi.UInt32(1), (record << DIGIT_BITS) + digit, ok & above)
+                i += 1
+            run += 1
+        dr.eval(counters)
+        return counters
+
+    @dr.syntax
+    def take(self, last: mi.UInt32, wanted: mi.UInt32, neighbours: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """Hits and records of the particles nearer than `last`, and of the first `wanted` at that very distance."""
+        slots = dr.full(mi.UInt32, 0xFFFFFFFF, self.n_records * neighbours)
+        first = dr.arange(mi.UInt32, self.n_records) * dr.opaque(mi.UInt32, neighbours)
+        taken, run = mi.UInt32(0), mi.UInt32(0)
+        while run < 9:
+            i, end = self.run(run)
+            while i < end:
+                key, ok = self.key(i, True)
+                equal = ok & (key == last) & (wanted > 0)
+                ok &= (key < last) | equal
+                wanted[equal] -= 1
+                dr.scatter(slots, i, first + taken, ok)
+                taken[ok] += 1
+                i += 1
+            run += 1
+        dr.eval(slots)
+        used = dr.compress(slots != 0xFFFFFFFF)
+        return dr.gather(mi.UInt32, self.hit, dr.gather(mi.UInt32, slots, used)), used // dr.opaque(mi.UInt32, neighbours)
+
+
+@dr.syntax
+def _select_digit(counters: mi.UInt32, wanted: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """Per record, the digit in which the `wanted`-th smallest key lies, and how many are still wanted in it.
+
+    A record with fewer keys than wanted gets the highest digit, and takes them all.
+    """
+    digit, below = mi.UInt32(0), mi.UInt32(0)
+    record = dr.arange(mi.UInt32, dr.width(wanted))
+    count = dr.gather(mi.UInt32, counters, record << DIGIT_BITS)
+    while (digit < (1 << DIGIT_BITS) - 1) & (below + count < wanted):
+        below += count
+        digit += 1
+        count = dr.gather(mi.UInt32, counters, (record << DIGIT_BITS) + digit)
+    return digit, wanted - below

@@ -1,0 +1,124 @@
+"""A guide: the cache finds the record, the representation holds its density, and this turns both to world space."""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import representations
+from olpm_bench.transport.cache import RecordCache
+from representations import state as states
+from representations.interface import ParticleBatch
+
+FORMAT = 1              # of guide files
+MIN_PARTICLES = 40      # records that have seen fewer leave the surface to its BSDF [L: undersampled below 5 K]
+
+
+class GuidedPoint:
+    """The distribution that serves a surface point, in world space.
+
+    `valid`: there is a record, and it has seen enough particles.
+    """
+
+    def __init__(self, guide: Guide, record: mi.UInt32, frame: mi.Frame3f, valid: mi.Bool) -> None:
+        self.guide, self.record, self.frame, self.valid = guide, record, frame, valid
+
+    def sample(self, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
+        """A direction distributed by `pdf`; a failed sample lies below the record's horizon."""
+        wo, _ = self.guide.representation.sample(self.guide.state, self.record, sample1, sample2, active & self.valid)
+        return self.frame.to_world(wo)
+
+    def pdf(self, d: mi.Vector3f) -> mi.Float:
+        """Density of a direction [1/sr]."""
+        return self.guide.representation.pdf(self.guide.state, self.record, self.frame.to_local(d), self.valid)
+
+
+class Guide:
+    """Learnt distributions of incident radiance (or importance) over a scene's surfaces.
+
+    Args:
+        cache: where the records are.
+        specification: the representation, as in a TOML: ``{"type": "gaussian_mixture", "components": 8}``.
+    """
+
+    def __init__(self, cache: RecordCache, specification: dict[str, Any]) -> None:
+        self.cache, self.specification = cache, specification
+        self.representation = representations.create(**specification)
+        self.state = self.representation.init(0)
+        self.count = dr.zeros(mi.UInt32, 0)     # particles seen by each record
+        self.particles = 0                      # particles stored over all passes
+
+    @property
+    def records(self) -> int:
+        return len(self.cache)
+
+    @property
+    def bytes_per_record(self) -> float:
+        """Learned state only, in bytes."""
+        return states.bytes_of(self.state) / max(self.records, 1)
+
+    def at(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> GuidedPoint:
+        """The distribution at a point with its normal, which looks to the side that light comes from."""
+        record, normal, valid = self.cache.lookup(p, n, active)
+        if self.records:
+            valid &= dr.gather(mi.UInt32, self.count, record, valid) >= MIN_PARTICLES
+        return GuidedPoint(self, record, mi.Frame3f(normal), valid)
+
+    # ---------------------- Learning ----------------------
+
+    def grow(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, seed: int) -> None:
+        """Add untrained records where the points have none."""
+        added = self.cache.grow(p, n, active)
+        if added:
+            self.state = states.append(self.state, self.representation.init(added, seed))
+            self.count = states.join(self.count, dr.zeros(mi.UInt32, added))
+            dr.eval(self.state, self.count)
+
+    def learn(self, batch: ParticleBatch, seed: int) -> None:
+        """One on-line update with the particles of one pass."""
+        self.state = self.representation.update(self.state, batch, seed)
+        self.count = self.count + batch.count()
+        self.particles += len(batch)
+        dr.eval(self.state, self.count)
+
+    # ---------------------- Files ----------------------
+
+    def save(self, path: str | Path) -> None:
+        """Write the guide to a compressed ``.npz`` file."""
+        meta = {"format": FORMAT, "representation": self.specification, "particles": self.particles}
+        arrays = {f"cache.{k}": v for k, v in self.cache.to_numpy().items()}
+        arrays |= {f"state.{k}": v for k, v in states.to_numpy(self.state).items()}
+        arrays |= {"meta": np.array(json.dumps(meta)), "count": self.count.numpy()}
+        with open(path, "wb") as file:
+            np.savez_compressed(file, **arrays)         # type: ignore[arg-type]  (its stub: all keywords are flags)
+
+    @staticmethod
+    def load(path: str | Path) -> Guide:
+        """Read a guide.
+
+        Raises:
+            ValueError: not a guide file, or one of a newer format.
+        """
+        try:
+            with np.load(path) as file:
+                arrays = dict(file)
+            meta = json.loads(str(arrays["meta"]))
+        except (OSError, KeyError, ValueError) as error:
+            raise ValueError(f"{path}: not a guide file ({error})") from error
+        if meta["format"] > FORMAT:
+            raise ValueError(f"{path}: guide format {meta['format']} is newer than this version's ({FORMAT})")
+
+        def part(prefix: str) -> dict[str, np.ndarray]:
+            return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+        guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"])
+        guide.state = states.from_numpy(guide.state, part("state."))
+        guide.count, guide.particles = mi.UInt32(arrays["count"]), meta["particles"]
+        return guide
+
+    def __repr__(self) -> str:
+        return f"Guide[{self.specification}, {self.records} records, {self.particles} particles]"

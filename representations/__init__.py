@@ -1,0 +1,91 @@
+"""Directional probability densities that learn from weighted directions: a library of its own.
+
+    >>> import mitsuba as mi; mi.set_variant("llvm_ad_rgb")
+    >>> import representations
+    >>> gmm = representations.create("gaussian_mixture", components=8)
+    >>> state = gmm.init(n_records=1000)
+
+This file is the registry, and the only place that names all representations.  A new one is a class that
+satisfies :class:`representations.interface.DirectionalPdf` and is found in one of three ways: a line in
+``BUILT_IN`` below, an entry point of the group ``olpm_bench.representations``, or ``path/to/file.py:ClassName``.
+"""
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import inspect
+import sys
+from pathlib import Path
+from typing import Any
+
+from representations import _llvm
+
+_llvm.select()          # before the first `import drjit` of the process
+
+ENTRY_POINTS = "olpm_bench.representations"
+BUILT_IN = {            # name -> module:Class, imported on first use
+    "cosine": "representations.cosine:CosineLobe",
+    "jensen": "representations.jensen:JensenHistogram",
+    "hey": "representations.hey:HeyCones",
+    "gaussian_mixture": "representations.gaussian_mixture:GaussianMixture",
+}
+
+
+class RepresentationError(ValueError):
+    """An unknown representation or hyper-parameter; the message lists the known ones."""
+
+
+def names() -> list[str]:
+    """Every registered name: the built-in ones and those of installed entry points."""
+    return sorted({*BUILT_IN, *(e.name for e in importlib.metadata.entry_points(group=ENTRY_POINTS))})
+
+
+def find(name: str) -> Any:
+    """The class behind a registered name or behind ``path/to/file.py:ClassName`` (which runs that file).
+
+    Raises:
+        RepresentationError: no such name, file or class.
+    """
+    if name in BUILT_IN:
+        module, _, attribute = BUILT_IN[name].partition(":")
+        return getattr(importlib.import_module(module), attribute)
+    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
+        return entry.load()
+    if ".py:" in name:
+        file, _, attribute = name.rpartition(":")
+        return _from_file(Path(file), attribute)
+    raise RepresentationError(f"unknown representation '{name}'; known: {', '.join(names())}, or path/to/file.py:ClassName")
+
+
+def create(type: str, **parameters: Any) -> Any:
+    """A representation with its hyper-parameters, e.g. ``create("gaussian_mixture", components=16)``.
+
+    The first argument is named as in a TOML, so that ``create(**{"type": "jensen"})`` works too.
+
+    Raises:
+        RepresentationError: unknown name; unknown, missing or invalid hyper-parameter.
+    """
+    cls = find(type)
+    known = list(inspect.signature(cls).parameters)
+    for key in parameters:
+        if key not in known:
+            raise RepresentationError(f"representation '{type}' has no parameter '{key}'; known: {', '.join(known) or 'none'}")
+    try:
+        return cls(**parameters)
+    except (TypeError, ValueError) as error:
+        raise RepresentationError(f"representation '{type}': {error}") from error
+
+
+def _from_file(file: Path, attribute: str) -> type:
+    if not file.is_file():
+        raise RepresentationError(f"representation file {file}: there is no such file")
+    module_name = f"representation_{file.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module           # dataclasses look their module up by name
+    spec.loader.exec_module(module)
+    if not hasattr(module, attribute):
+        raise RepresentationError(f"representation file {file} has no class '{attribute}'")
+    return getattr(module, attribute)

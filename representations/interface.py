@@ -1,0 +1,109 @@
+"""The contract of a representation: *the interface is a promise about probability*.
+
+A representation is a family of probability densities over the upper hemisphere, one density for each *record*
+of a spatial cache, all held in one structure of arrays.  Hyper-parameters are attributes of an ordinary class;
+what is learnt is a separate *state*: a plain dataclass whose fields are flat Dr.Jit arrays of
+``n_records * stride`` entries, record-major, with a stride that never changes.  So the owner of the records
+can append new ones, save, load and count the bytes of any state without knowing what it means
+(:mod:`representations.state`).
+
+Sign convention (the only place it is stated): a direction ``wo`` is a unit vector in the record's own frame
+(s, t, n), n = (0, 0, 1), and points *away from the surface*, to where light comes from or importance comes
+from.  Densities are per solid angle [1/sr] and zero for ``wo.z <= 0``.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+
+State = TypeVar("State")
+
+
+@dataclass
+class ParticleBatch:
+    """Particles grouped by record, in compressed rows: those of record r are ``offset[r] .. offset[r + 1] - 1``.
+
+    The order does not depend on the scheduling of threads, so that training repeats bit for bit.
+    """
+    wo: mi.Vector3f         # [n] direction the particle came from, in the record's frame
+    weight: mi.Float        # [n] luminance of flux or importance; only ratios within a record matter
+    distance: mi.Float      # [n] length of the particle's last segment [scene units]
+    record: mi.UInt32       # [n] ascending
+    offset: mi.UInt32       # [n_records + 1]
+
+    @property
+    def n_records(self) -> int:
+        return len(self.offset) - 1
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    def count(self) -> mi.UInt32:
+        """Particles of each record [n_records]."""
+        record = dr.arange(mi.UInt32, self.n_records)
+        return dr.gather(mi.UInt32, self.offset, record + 1) - dr.gather(mi.UInt32, self.offset, record)
+
+    @staticmethod
+    def from_arrays(wo: mi.Vector3f, weight: mi.Float, record: mi.UInt32, n_records: int,
+                    distance: mi.Float | None = None) -> ParticleBatch:
+        """Group particles by record with a stable sort; entries with ``record >= n_records`` are left out.
+
+        Raises:
+            ValueError: a direction or weight is not finite, or a weight is negative.
+        """
+        if not dr.all(dr.isfinite(weight) & (weight >= 0) & dr.all(dr.isfinite(wo)), axis=None):
+            raise ValueError("particles with a NaN, infinite or negative weight or direction")
+        order, record, offset = group(record, n_records)
+        batch = ParticleBatch(
+            wo=dr.gather(mi.Vector3f, wo, order), weight=dr.gather(mi.Float, weight, order),
+            distance=dr.gather(mi.Float, distance, order) if distance is not None else dr.full(mi.Float, dr.inf, len(order)),
+            record=record, offset=offset)
+        dr.eval(batch)
+        return batch
+
+
+def group(key: mi.UInt32, n_keys: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    """Stable grouping by key: ``(order, key[order], offset)``; entries with ``key >= n_keys`` are left out.
+
+    The entries of key k are ``order[offset[k]] .. order[offset[k + 1] - 1]``, in their original order.
+    """
+    count = dr.zeros(mi.UInt32, n_keys + 1)
+    dr.scatter_add(count, mi.UInt32(1), key, key < dr.opaque(mi.UInt32, n_keys))     # a literal would recompile
+    offset = dr.prefix_sum(count)
+    order = dr.argsort(key)
+    inside = dr.arange(mi.UInt32, int(offset[n_keys]))      # the keys left out are at the end
+    order = dr.gather(mi.UInt32, order, inside)
+    return order, dr.gather(mi.UInt32, key, order), offset
+
+
+class DirectionalPdf(Protocol[State]):
+    """Four verbs.  `check` them with a chi-square test: `sample` and `pdf` must be the same distribution."""
+
+    def init(self, n_records: int, seed: int = 0) -> State:
+        """A state that already is a valid density for every record, before any particle."""
+        ...
+
+    def update(self, state: State, batch: ParticleBatch, seed: int = 0) -> State:
+        """Learn from one batch (``batch.n_records`` records, as many as the state); return the new state.
+
+        First fit and on-line update are this one verb.  Pure: the argument is left alone and the result depends
+        on nothing but the arguments.  A record without particles in the batch keeps its density.  Zero weights
+        teach nothing.  The batch is never seen again.
+        """
+        ...
+
+    def sample(self, state: State, record: mi.UInt32, sample1: mi.Float, sample2: mi.Point2f,
+               active: mi.Bool = True) -> tuple[mi.Vector3f, mi.Float]:
+        """Map uniform numbers in [0, 1) to ``(wo, pdf)``, with the very density that :meth:`pdf` returns for ``wo``.
+
+        A sample may fail (land outside the hemisphere): its pdf is then 0 and its ``wo`` lies below the horizon, and
+        the integral of `pdf` is below 1 by the probability of that.
+        """
+        ...
+
+    def pdf(self, state: State, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
+        """The density realised by :meth:`sample` [1/sr]: finite, >= 0, 0 for ``wo.z <= 0``, integral <= 1."""
+        ...

@@ -1,0 +1,269 @@
+"""The commands: what they print, their exit codes, and one line for every expected mistake."""
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from olpm_bench.bench.results import Reference, read_exr, write_reference
+from olpm_bench.cli import app
+
+ROOT = Path(__file__).resolve().parents[2]
+TOML = """
+title = "Test"
+seeds = 2
+[budget]
+spp = 4
+checkpoints = 2
+[[scene]]
+name = "cornell_box"
+width = 48
+height = 36
+max_depth = 3
+[[method]]
+name = "Path tracing"
+[[method]]
+name = "No roulette"
+integrator = { roulette = "none" }
+"""
+
+
+def call(*arguments: object):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def process(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    command = [sys.executable, "-m", "olpm_bench.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=env, timeout=120)
+
+
+def complaint(result) -> str:
+    """The one line of a refusal."""
+    lines = result.stderr.splitlines()
+    assert (getattr(result, "exit_code", None) or getattr(result, "returncode", None)) == 2, result.stderr
+    assert len(lines) == 1 and lines[0].startswith("olpm-bench: "), result.stderr
+    return lines[0]
+
+
+@pytest.fixture
+def experiment(tmp_path) -> Path:
+    from olpm_bench.bench import config
+
+    path = tmp_path / "test.toml"
+    path.write_text(TOML)
+    loaded = config.load(path)
+    grey = np.full((36, 48, 3), 0.5, np.float32)
+    reference = Reference(grey, grey + 0.01, grey, grey, {"spp_a": 1, "spp_b": 1})
+    write_reference(tmp_path / "results" / "references" / loaded.reference_key(loaded.scene[0]), reference)
+    return path
+
+
+# ---------------------------------------------------------------- start-up
+
+def test_help_loads_nothing_heavy():
+    heavy = "drjit", "mitsuba", "numpy", "pydantic", "matplotlib", "colour", "skimage", "OpenEXR"
+    code = f"import sys, olpm_bench.cli; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_help_names_every_command():
+    result = call("--help")
+    assert result.exit_code == 0
+    for name in ("run", "reference", "render", "fit", "perf", "list"):
+        assert f"  {name} " in result.output
+
+
+def test_list_shows_scenes_representations_and_experiments(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    result = call("list")
+    assert result.exit_code == 0
+    for word in ("door_ajar", "gap = ", "gaussian_mixture", "experiments/quickstart.toml: Door ajar"):
+        assert word in result.output
+
+
+# ---------------------------------------------------------------- run
+
+def test_run_prints_the_table_and_writes_the_report(experiment, tmp_path):
+    result = call("run", experiment, "--results", tmp_path / "results")
+    assert result.exit_code == 0, result.output
+    assert "Path tracing" in result.stdout and "No roulette" in result.stdout
+    folder = tmp_path / "results" / "test"
+    for name in ("summary.json", "table.csv", "figure.png", "figure.pdf", "sheet.png", "experiment.toml", "env.json"):
+        assert (folder / name).stat().st_size > 0
+    rows = json.loads((folder / "summary.json").read_text())["rows"]
+    assert [row["spp"] for row in rows] == [4, 4] and rows[0]["seeds"] == [0, 1]
+
+
+def test_dry_run_runs_nothing(experiment, tmp_path):
+    result = call("run", experiment, "--results", tmp_path / "results", "--dry-run")
+    assert result.exit_code == 0 and "4 of 4 cells to run" in result.stdout and "GB" in result.stdout
+    assert result.stdout.count("seed") == 4 and not (tmp_path / "results" / "test").exists()
+
+
+def test_a_failed_cell_exits_with_1(experiment, tmp_path, monkeypatch):
+    from olpm_bench.bench import run
+
+    def fail(*args, **kwargs):
+        raise run.CellFailedError("3 pixels are NaN")
+
+    monkeypatch.setattr(run, "measure", fail)
+    result = call("run", experiment, "--results", tmp_path / "results")
+    assert result.exit_code == 1 and "4 of 4 cells are not complete" in result.stderr
+    assert "cornell_box / Path tracing / seed 0: 3 pixels are NaN" in result.stderr
+
+
+def test_a_full_disk_is_one_line(experiment, tmp_path, monkeypatch):
+    from olpm_bench.bench import run
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device", "results/cells/x")
+
+    monkeypatch.setattr(run, "measure", full)
+    assert complaint(call("run", experiment, "--results", tmp_path / "results")) == \
+        "olpm-bench: results/cells/x: No space left on device"
+
+
+def test_sigterm_exits_with_130_and_the_rest_is_run_later(experiment, tmp_path):
+    results = tmp_path / "results"
+    experiment.write_text(TOML.replace("spp = 4", "spp = 400"))
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "olpm_bench.cli", "run", str(experiment), "--results", str(results)]
+    running = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 100
+        while not list(results.rglob("cell.json")) and running.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        running.send_signal(signal.SIGTERM)
+        _, errors = running.communicate(timeout=60)
+    finally:
+        running.kill()
+    assert running.returncode == 130 and "interrupted" in errors and "Traceback" not in errors
+    complete = list(results.rglob("cell.json"))
+    assert 1 <= len(complete) < 4
+    assert not [f for f in results.rglob("*") if f.name == "lock" or ".tmp" in f.name]
+    before = {f: f.stat().st_mtime_ns for f in complete}
+    result = call("run", experiment, "--results", results)
+    assert result.exit_code == 0, result.output
+    assert {f: f.stat().st_mtime_ns for f in complete} == before and len(list(results.rglob("cell.json"))) == 4
+
+
+# ---------------------------------------------------------------- reference
+
+def test_reference_makes_what_run_asks_for(experiment, tmp_path):
+    results = tmp_path / "elsewhere"
+    assert f"olpm-bench reference {experiment}" in complaint(call("run", experiment, "--results", results))
+    result = call("reference", experiment, "--results", results, "--seconds", 1)
+    assert result.exit_code == 0 and "floor mean|A-B|/2 = " in result.stderr
+    assert len(list((results / "references").glob("cornell_box-48x36-*/meta.json"))) == 1
+    assert call("run", experiment, "--results", results, "--dry-run").exit_code == 0
+
+
+# ---------------------------------------------------------------- render
+
+def test_render_writes_an_image_and_ends_with_json(tmp_path):
+    out = tmp_path / "box.exr"
+    result = call("render", "cornell_box", "--method", "unguided", "--set", "scene.light_size=0.4", "--set",
+                  "integrator.roulette=none", "--spp", 5, "--width", 16, "--height", 12, "--max-depth", 3, "--seed", 3,
+                  "--out", out)
+    assert result.exit_code == 0, result.output
+    shown = json.loads(result.stdout.splitlines()[-1])
+    assert shown["spp"] == 5 and shown["seed"] == 3 and shown["parameters"]["light_size"] == 0.4
+    assert shown["integrator"]["roulette"] == "none" and shown["integrator"]["max_depth"] == 3
+    assert shown["versions"]["mitsuba"] and shown["train_seconds"] == 0 and shown["charged_seconds"] > 0
+    parts, header = read_exr(out)
+    assert set(parts) == {"mean", "variance", "count"} and parts["mean"].shape == (12, 16, 3)
+    assert header["spp"] == 5 and (tmp_path / "box.png").stat().st_size > 0
+
+
+def test_a_guide_is_saved_and_used_again(tmp_path):
+    options = ("--method", "cosine", "--spp", 2, "--width", 16, "--height", 12, "--max-depth", 3)
+    training = ("--set", "training.passes=1", "--set", "training.photons=500", "--set", "training.importons=100")
+    guide = tmp_path / "g.npz"
+    first = call("render", "cornell_box", *options, *training, "--out", tmp_path / "a.exr", "--save-guide", guide)
+    assert first.exit_code == 0, first.output
+    again = call("render", "cornell_box", *options, "--out", tmp_path / "b.exr", "--load-guide", guide)
+    assert again.exit_code == 0, again.output
+    trained, loaded = (json.loads(r.stdout.splitlines()[-1]) for r in (first, again))
+    assert trained["train_seconds"] > 0 and loaded["train_seconds"] == 0 and loaded["records"] == trained["records"] > 0
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0]["mean"], read_exr(tmp_path / "b.exr")[0]["mean"])
+    other = call("render", "cornell_box", "--method", "jensen", *options[2:], "--out", tmp_path / "c.exr",
+                 "--load-guide", guide)
+    assert "type 'cosine'" in complaint(other)
+
+
+RENDER = ("render", "cornell_box", "--spp", "1", "--out", "x.exr")
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (("run", "missing.toml"), ["missing.toml", "no such file"]),
+    (("run", "bad.toml"), ["unknown key 'sede' in bad.toml", "seeds"]),
+    (("run", "good.toml", "--scene", "cornell_box"), ["--scene cornell_box: must be NAME=PATH"]),
+    (("run", "good.toml", "--scene", "room=x.xml"), ["no scene 'room'", "known: cornell_box"]),
+    (("run", "good.toml", "--results", "newer"), ["schema_version = 7 is newer"]),
+    (("reference", "missing.toml"), ["no such file"]),
+    ((*RENDER, "--method", "gmm"), ["unknown representation 'gmm'", "gaussian_mixture"]),
+    ((*RENDER, "--method", "unguided", "--seconds", "1"), ["either --seconds or --spp"]),
+    ((*RENDER, "--method", "unguided", "--set", "passes=1"), ["--set passes=1", "key=value"]),
+    ((*RENDER, "--method", "unguided", "--set", "bench.passes=1"), ["unknown table 'bench'", "scene, integrator"]),
+    ((*RENDER, "--method", "unguided", "--set", "training.passes=1"), ["--method with a representation"]),
+    ((*RENDER, "--method", "cosine", "--set", "training.pases=1"), ["unknown key 'pases'", "passes"]),
+    ((*RENDER, "--method", "cosine", "--set", "training.photons=-1"), ["photons = -1", ">= 1"]),
+    ((*RENDER, "--method", "cosine", "--set", "representation.k=1"), ["no parameter 'k'"]),
+    ((*RENDER, "--method", "unguided", "--set", "scene.gap=1"), ["no parameter 'gap'", "light_size"]),
+    ((*RENDER, "--method", "unguided", "--width", "0"), ["width", "0", "greater than or equal to 1"]),
+    ((*RENDER, "--method", "unguided", "--threads", "0"), ["--threads 0", ">= 1"]),
+    ((*RENDER, "--method", "unguided", "--save-guide", "g.npz"), ["--save-guide", "representation"]),
+    ((*RENDER, "--method", "cosine", "--load-guide", "g.npz"), ["g.npz", "no such file"]),
+    (("render", "no.xml", "--spp", "1", "--out", "x.exr", "--method", "unguided"), ["no.xml", "no such file"]),
+    (("render", "no_scene", "--spp", "1", "--out", "x.exr", "--method", "unguided"), ["no_scene", "cornell_box"]),
+    (("render", "cornell_box", "--spp", "1", "--out", "x.png", "--method", "unguided"), ["x.png", ".exr"]),
+    (("render", "cornell_box", "--spp", "1", "--out", "no/x.exr", "--method", "unguided"), ["no folder no"]),
+    (("fit", "--representation", "gmm", "--samples", "s.npz", "--heldout", "h.npz"), ["unknown representation 'gmm'"]),
+    (("fit", "--representation", "cosine", "--samples", "s.npz", "--heldout", "h.npz"), ["s.npz"]),
+    (("fit", "--representation", "cosine", "--set", "training.passes=1", "--samples", "s.npz", "--heldout", "h.npz"),
+     ["unknown table 'training'"]),
+])
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    Path("good.toml").write_text(TOML)
+    Path("bad.toml").write_text(TOML.replace("seeds", "sede"))
+    Path("newer/good").mkdir(parents=True)
+    Path("newer/good/summary.json").write_text('{"schema_version": 7}')
+    text = complaint(call(*arguments))
+    for word in words:
+        assert word in text
+
+
+def test_bad_usage_exits_with_2_too():
+    for arguments in (("run",), ("rnu", "x"), ("render", "cornell_box"), ("run", "x.toml", "--resutls", "y")):
+        assert call(*arguments).exit_code == 2
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono_polarized", "scalar_rgb", "nonsense"])
+def test_other_variants_are_refused(tmp_path, monkeypatch, variant):
+    monkeypatch.setenv("OLPM_BENCH_VARIANT", variant)
+    monkeypatch.chdir(tmp_path)
+    text = complaint(call(*RENDER, "--method", "unguided"))
+    assert variant in text and "llvm_ad_rgb, cuda_ad_rgb" in text
+
+
+def test_no_traceback_from_the_real_command(tmp_path):
+    done = process("run", tmp_path / "missing.toml")
+    assert "no such file" in complaint(done) and done.stdout == ""
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch):
+    from olpm_bench import scenes
+
+    monkeypatch.setattr(scenes, "names", lambda: 1 / 0)
+    assert isinstance(call("list").exception, ZeroDivisionError)

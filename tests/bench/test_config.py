@@ -1,0 +1,201 @@
+"""Experiment files: what is read, what is refused and with which words, and what determines a cell."""
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from olpm_bench.bench import config
+from olpm_bench.bench.config import ConfigError
+
+MINIMAL = """
+title = "Test"
+seeds = 2
+[budget]
+spp = 8
+[[scene]]
+name = "cornell_box"
+width = 16
+height = 12
+[training]
+passes = 2
+[[method]]
+name = "Path tracing"
+[[method]]
+name = "Cosine"
+representation = { type = "cosine" }
+integrator = { roulette = "none" }
+"""
+XML = '<scene version="3.0.0"><default name="resx" value="4"/></scene>'
+
+
+def load(tmp_path: Path, text: str, **arguments) -> config.Experiment:
+    file = tmp_path / "test.toml"
+    file.write_text(text)
+    return config.load(file, **arguments)
+
+
+def message(tmp_path: Path, text: str, **arguments) -> str:
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, text, **arguments)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_what_is_written_and_what_is_the_default(tmp_path):
+    experiment = load(tmp_path, MINIMAL)
+    assert experiment.seeds == [0, 1] and experiment.budget.checkpoints == 8
+    scene, (unguided, cosine) = experiment.scene[0], experiment.method
+    assert experiment.training_of(unguided) is None
+    assert experiment.training_of(cosine).passes == 2
+    assert experiment.integrator_of(scene, unguided).roulette == "throughput"
+    assert experiment.integrator_of(scene, cosine).roulette == "none"
+    assert experiment.path == tmp_path / "test.toml"
+
+
+def test_methods_are_interleaved(tmp_path):
+    cells = load(tmp_path, MINIMAL).cells()
+    assert [c.method.name for c in cells] == ["Path tracing", "Cosine"] * 2 and [c.seed for c in cells] == [0, 0, 1, 1]
+
+
+def test_a_scenes_depth_wins(tmp_path):
+    text = MINIMAL.replace("height = 12", "height = 12\nmax_depth = 4") + "[integrator]\nmax_depth = 9\n"
+    experiment = load(tmp_path, text)
+    assert experiment.max_depth(experiment.scene[0]) == 4
+    assert all(c.integrator.max_depth == 4 for c in experiment.cells())
+
+
+def test_presets_apply_before_changes(tmp_path):
+    experiment = load(tmp_path, MINIMAL.replace("passes = 2", 'preset = "paper2014"\npasses = 3'))
+    assert experiment.training.gather == "nearest" and experiment.training.passes == 3
+    own = load(tmp_path, MINIMAL + 'training = { preset = "paper2014", photons = 7 }\n')
+    assert own.training_of(own.method[1]).gather == "nearest" and own.training_of(own.method[1]).photons == 7
+
+
+@pytest.mark.parametrize("old, new, words", [
+    ("seeds = 2", "sedes = 2", ["unknown key 'sedes' in test.toml", "known:", "seeds"]),
+    ("spp = 8", "spps = 8", ["unknown key 'spps' in test.toml [budget]", "seconds, spp, checkpoints"]),
+    ("width = 16", "widht = 16", ["'widht' in test.toml [[scene]] 1", "width"]),
+    ("passes = 2", "pases = 2", ["unknown key 'pases' in test.toml [training]", "preset", "photons"]),
+    ("[training]", "[trainig]", ["unknown key 'trainig' in test.toml", "training"]),
+    ('roulette = "none"', 'roulete = "none"', ["'Cosine'", "unknown key 'roulete'", "roulette"]),
+    ('roulette = "none"', 'roulette = "russian"', ["'Cosine'", "roulette", "'russian'", "'throughput'", "'none'"]),
+    ('roulette = "none"', "max_depth = 5", ["max_depth", "[[scene]]"]),
+    ("spp = 8", "spp = 8\nseconds = 3", ["[budget]", "either seconds or spp"]),
+    ("spp = 8", "", ["[budget]", "either seconds or spp"]),
+    ("spp = 8", "spp = -8", ["[budget]: spp", "-8", "greater than or equal to 1"]),
+    ("spp = 8", "seconds = nan", ["[budget]: seconds"]),
+    ("spp = 8", "spp = 8.5", ["[budget]: spp", "8.5"]),
+    ("width = 16", 'width = "16"', ["[[scene]] 1: width", "'16'", "integer"]),
+    ("width = 16", "", ["missing key 'width'", "[[scene]] 1"]),
+    ('title = "Test"', "", ["missing key 'title' in test.toml"]),
+    ("passes = 2", "photons = -3", ["[training]", "photons = -3", ">= 1"]),
+    ("passes = 2", 'passes = "2"', ["[training]", "passes", "'2'"]),
+    ("passes = 2", 'preset = "slow"', ["[training]", "unknown preset 'slow'", "fast, paper2014"]),
+    ("seeds = 2", "seeds = 0", ["seeds = 0", "must be 1 to"]),
+    ("seeds = 2", "seeds = [1, 1]", ["seeds", "different"]),
+    ("seeds = 2", "seeds = [-1]", ["seeds", "0 to"]),
+    ("seeds = 2", "schema_version = 2", ["schema_version = 2", "must be <= 1"]),
+    ('name = "Cosine"', 'name = "Path tracing"', ["two methods of one name 'Path tracing'"]),
+    ('name = "Cosine"', 'name = "Path-tracing"', ["'Path tracing' and 'Path-tracing'", "folder"]),
+    ('type = "cosine"', 'type = "cosin"', ["'Cosine'", "unknown representation 'cosin'", "gaussian_mixture"]),
+    ('type = "cosine"', 'type = "cosine", k = 8', ["representation 'cosine' has no parameter 'k'"]),
+    ('type = "cosine"', 'type = "missing.py:A"', ["missing.py", "no such file"]),
+    ('{ type = "cosine" }', "{ k = 8 }", ["representation needs a type", "cosine"]),
+    ('name = "Path tracing"', 'name = "Path tracing"\ntraining = { passes = 1 }', ["no representation to train"]),
+    ('"cornell_box"', '"cornel_box"', ["unknown scene", "'cornel_box'", "cornell_box", "door_ajar"]),
+    ("width = 16", "width = 16\nparameters = { gap = 1 }", ["no parameter 'gap'", "light_size"]),
+    ("width = 16", "width = 16\noverrides = { gap = 1 }", ["overrides belong to files"]),
+    ("width = 16", 'width = 16\nfile = "no.xml"', ["no.xml", "no such file", "--scene"]),
+    ("width = 16", 'width = 16\nreference = "no.exr"', ["no.exr", "no such file"]),
+    ("width = 16", "width = 16\nmax_depth = 0", ["max_depth = 0", ">= 1, or -1"]),
+    ("spp = 8", "spp = ", ["test.toml is not valid TOML", "line 5"]),
+])
+def test_mistakes_are_named_with_what_is_allowed(tmp_path, old, new, words):
+    assert old in MINIMAL
+    text = message(tmp_path, MINIMAL.replace(old, new, 1))
+    for word in words:
+        assert word in text, text
+
+
+def test_a_missing_file_and_one_that_is_no_text(tmp_path):
+    with pytest.raises(ConfigError, match=r"nothing\.toml: there is no such file"):
+        config.load(tmp_path / "nothing.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        config.load(tmp_path / "binary.toml")
+
+
+def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "room.xml").write_text(XML)
+    (tmp_path / "mine.py").write_text("class Mine:\n    def __init__(self, k=3): self.k = k\n")
+    monkeypatch.chdir(Path(__file__).parent)
+    text = MINIMAL.replace("width = 16", 'width = 16\nfile = "scenes/room.xml"\noverrides = { resx = 8 }')
+    experiment = load(tmp_path, text.replace('type = "cosine"', 'type = "mine.py:Mine"'))
+    assert experiment.scene[0].file == (tmp_path / "scenes" / "room.xml").resolve()
+    assert experiment.method[1].create().k == 3
+    assert experiment.cells()[1].config()["representation"]["k"] == 3
+
+
+def test_a_scene_can_be_pointed_elsewhere(tmp_path):
+    (tmp_path / "other.xml").write_text(XML)
+    text = MINIMAL.replace("width = 16", 'width = 16\nfile = "no.xml"')
+    assert load(tmp_path, text, scenes={"cornell_box": tmp_path / "other.xml"}).scene[0].file.name == "other.xml"
+    assert "known: cornell_box" in message(tmp_path, text, scenes={"room": tmp_path / "other.xml"})
+
+
+def test_the_resolved_file_describes_the_same_cells(tmp_path):
+    (tmp_path / "room.xml").write_text(XML)
+    second = '[[scene]]\nname = "a \\"room\\""\nfile = "room.xml"\nwidth = 8\nheight = 8\noverrides = { resx = 8 }\n'
+    experiment = load(tmp_path, MINIMAL + second)
+    folder = tmp_path / "results" / "test"
+    folder.mkdir(parents=True)
+    (folder / "experiment.toml").write_text(experiment.toml(folder))
+    again = config.load(folder / "experiment.toml")
+    assert [c.key for c in again.cells()] == [c.key for c in experiment.cells()]
+    resolved = tomllib.loads(experiment.toml())
+    assert resolved["schema_version"] == 1 and resolved["method"][1]["training"]["neighbours"] == 250
+    assert resolved["scene"][0]["parameters"]["light_size"] == 0.5
+
+
+@pytest.mark.parametrize("old, new", [
+    ("spp = 8", "spp = 9"), ("width = 16", "width = 17"), ("passes = 2", "passes = 3"), ('"none"', '"throughput"'),
+    ('type = "cosine"', 'type = "jensen"'), ("width = 16", "width = 16\nparameters = { rotation = 12 }"),
+    ("width = 16", "width = 16\nmax_depth = 4"),
+])
+def test_the_key_changes_with_all_that_determines_the_cell(tmp_path, old, new):
+    before, after = load(tmp_path, MINIMAL).cells()[1], load(tmp_path, MINIMAL.replace(old, new)).cells()[1]
+    assert before.key != after.key
+
+
+@pytest.mark.parametrize("old, new", [
+    ('title = "Test"', 'title = "Another"'), ("seeds = 2", "seeds = [0, 7]"), ('"Cosine"', '"Lambert"'),
+    ("width = 16", "width = 16\nparameters = { light_size = 0.5 }"), ("passes = 2", "passes = 2\nneighbours = 250"),
+])
+def test_the_key_ignores_labels_and_written_out_defaults(tmp_path, old, new):
+    assert load(tmp_path, MINIMAL).cells()[1].key == load(tmp_path, MINIMAL.replace(old, new)).cells()[1].key
+
+
+def test_the_key_follows_the_scenes_files_and_not_their_dates(tmp_path):
+    (tmp_path / "mesh.ply").write_text("ply")
+    xml = tmp_path / "room.xml"
+    shape = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape>'
+    xml.write_text(XML.replace("</scene>", shape + "</scene>"))
+    text = MINIMAL.replace("width = 16", 'width = 16\nfile = "room.xml"')
+    keys = [load(tmp_path, text).reference_key(load(tmp_path, text).scene[0])]
+    for write in (lambda: xml.touch(), lambda: (tmp_path / "mesh.ply").write_text("ply and more"),
+                  lambda: xml.write_text(XML)):
+        write()
+        experiment = load(tmp_path, text)
+        keys.append(experiment.reference_key(experiment.scene[0]))
+    assert keys[0] == keys[1] and len(set(keys)) == 3
+    assert all(key.startswith("cornell_box-16x12-") for key in keys)
+
+
+def test_a_reference_depends_on_the_image_and_not_on_methods_or_budget(tmp_path):
+    a, b = load(tmp_path, MINIMAL), load(tmp_path, MINIMAL.replace("spp = 8", "seconds = 3").replace("passes = 2", ""))
+    c = load(tmp_path, MINIMAL + "[integrator]\nmax_depth = 3\n")
+    assert a.reference_key(a.scene[0]) == b.reference_key(b.scene[0]) != c.reference_key(c.scene[0])
+    assert a.cells()[0].reference_key == a.reference_key(a.scene[0])

@@ -1,0 +1,124 @@
+"""Statistics against closed forms and simulated data."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from olpm_bench.bench import statistics
+
+TIMES = np.geomspace(1, 16, 9)
+
+
+def converging(factor: float, times: np.ndarray = TIMES) -> np.ndarray:
+    """The error of a Monte Carlo estimate: factor / sqrt(t)."""
+    return factor / np.sqrt(times)
+
+
+def curve(*factors: float, times: np.ndarray = TIMES) -> statistics.Curve:
+    return statistics.common_curve([times] * len(factors), [converging(f, times) for f in factors])
+
+
+def test_median_band_is_the_quantiles_over_seeds():
+    band = statistics.median_band(np.arange(101.0)[:, None] * [1, 2])
+    np.testing.assert_allclose(band, [[50, 100], [5, 10], [95, 190]])
+    assert statistics.median_band([3.0]) == (3, 3, 3)
+
+
+def test_geometric_mean():
+    assert statistics.geometric_mean([2, 8]) == pytest.approx(4)
+    assert statistics.geometric_mean([3, 1 / 3]) == pytest.approx(1)
+    for ratios in ([], [1, 0], [1, -2], [1, np.nan], [np.inf]):
+        with pytest.raises(ValueError, match="must be positive and finite"):
+            statistics.geometric_mean(ratios)
+
+
+def test_a_slope_of_minus_one_half_interpolates_exactly():
+    at = np.random.default_rng(1).uniform(1, 16, 100)
+    np.testing.assert_allclose(statistics.interpolate(TIMES, converging(3), at), converging(3, at), rtol=1e-12)
+
+
+def test_nothing_is_extrapolated():
+    assert np.isnan(statistics.interpolate(TIMES, converging(3), np.array([0.99, 16.1]))).all()
+    assert np.isnan(statistics.time_to_error(TIMES, converging(4), 0.99))       # ends at 1
+    assert np.isnan(statistics.time_to_error(TIMES, converging(4), 4.01))       # starts at 4
+
+
+def test_time_to_error_inverts_the_curve_and_takes_the_first_crossing():
+    for error in (4, 2.7, 1.3, 1):
+        assert statistics.time_to_error(TIMES, converging(4), error) == pytest.approx((4 / error) ** 2)
+    assert statistics.time_to_error(np.array([1.0, 2, 4, 8]), np.array([4.0, 1, 3, 1]), 1) == 2
+
+
+def test_seeds_with_different_checkpoints_meet_on_the_times_that_all_cover():
+    a, b = np.geomspace(1, 15, 8), np.geomspace(1.5, 17, 6)
+    both = statistics.common_curve([a, b], [converging(2, a), converging(6, b)])
+    assert both.times[0] == 1.5 and both.times[-1] == 15 and both.errors.shape == (2, both.times.size)
+    np.testing.assert_allclose(both.errors, [converging(2, both.times), converging(6, both.times)])
+    np.testing.assert_allclose(both.median, converging(4, both.times))
+
+
+@pytest.mark.parametrize(("times", "errors", "message"), [
+    ([[1, 2], [3, 4]], [[1, 1], [1, 1]], "share no time"),
+    ([[2, 1]], [[1, 1]], "must increase"),
+    ([[0, 1]], [[1, 1]], "must increase"),
+    ([[1, 2]], [[1]], "one per error"),
+    ([[1, 2]], [[1, np.nan]], "positive and finite"),
+    ([[1, 2]], [[1, 0]], "positive and finite"),
+])
+def test_curves_that_cannot_be_compared_are_refused(times, errors, message):
+    with pytest.raises(ValueError, match=message):
+        statistics.common_curve([np.array(t, float) for t in times], [np.array(e, float) for e in errors])
+
+
+def test_speed_up_of_two_converging_curves_is_the_squared_ratio_of_their_errors():
+    slow, fast = curve(4, 4.4, 3.6), curve(2, 2.2, 1.8)
+    for a, b, expected in ((slow, fast, 4), (fast, slow, 1 / 4)):
+        ratio = statistics.speed_up(a, b)
+        assert ratio.value == pytest.approx(expected) and ratio.bound == ""
+        assert ratio.low == pytest.approx(expected) and ratio.high == pytest.approx(expected)      # paired: no spread
+    assert statistics.speed_up(slow, fast, error=1.5).value == pytest.approx(4)
+    assert statistics.error_ratio(slow, fast).value == pytest.approx(2)
+    assert statistics.error_ratio(slow, fast, seconds=3).value == pytest.approx(2)
+
+
+def test_speed_up_only_where_both_curves_reach_the_error():
+    slow, fast = curve(4, 4), curve(2, 2)
+    assert np.isnan(statistics.speed_up(slow, fast, error=0.9).value)       # slow ends at 1
+    assert np.isnan(statistics.speed_up(slow, fast, error=4.5).value)       # both start below
+    bounded = statistics.speed_up(slow, fast, error=2.5)                    # fast starts at 2, at time 1
+    assert bounded.value == pytest.approx((4 / 2.5) ** 2) and bounded.bound == ">"
+    assert statistics.speed_up(fast, slow, error=2.5).bound == "<"
+    assert np.isnan(statistics.error_ratio(slow, fast, seconds=17).value)
+    with pytest.raises(ValueError, match="2 and 3 seeds"):
+        statistics.speed_up(slow, curve(1, 2, 3))
+
+
+def test_pairing_removes_what_the_seeds_share():
+    rng = np.random.default_rng(2)
+    shared, own = rng.lognormal(0, 0.5, 12), rng.lognormal(0, 0.01, 12)
+    slow, fast = curve(*(4 * shared)), curve(*(2 * shared * own))
+    interval = statistics.error_ratio(slow, fast)
+    assert 1.97 < interval.low <= interval.value <= interval.high < 2.03
+
+
+def test_bootstrap_repeats_and_needs_two_seeds():
+    data = np.random.default_rng(3).normal(size=9)
+    intervals = [statistics.bootstrap(lambda index: data[index].mean(), 9) for _ in range(2)]
+    assert intervals[0] == intervals[1] and intervals[0].low < data.mean() < intervals[0].high
+    single = statistics.bootstrap(lambda index: 7.0, 1)
+    assert single.value == 7 and np.isnan([single.low, single.high]).all()
+
+
+def test_bootstrap_interval_covers_the_truth_as_often_as_it_says():
+    """Mean of 25 normal values.  The interval is z std(ddof=0) / sqrt(n), whose coverage is known."""
+    n, trials, significance = 25, 300, 1e-4
+    rng = np.random.default_rng(4)
+    covered = 0
+    for trial in range(trials):
+        data = rng.normal(size=n)
+        low, high = statistics.bootstrap(lambda index, data=data: data[index].mean(), n, seed=trial)[1:3]
+        covered += low <= 0 <= high
+    z = stats.norm.ppf(0.95) * np.sqrt((n - 1) / n)
+    expected = stats.t.cdf(z, n - 1) - stats.t.cdf(-z, n - 1)       # 0.88
+    assert stats.binomtest(covered, trials, expected).pvalue > significance

@@ -1,0 +1,150 @@
+"""The summary against a results folder whose errors are known."""
+from __future__ import annotations
+
+import csv
+import io
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from olpm_bench.bench import config, metrics, statistics, summary
+from olpm_bench.bench.results import Reference, ResultError, Results
+
+KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "relmse", "relmse_trimmed", "work_normalised_variance",
+        "mean", "mean_stderr", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
+        "bytes_per_record", "particles", "invalid_pixels"]
+ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
+TIMES = [1.0, 4.0, 16.0]
+
+
+def folder(tmp_path, errors: dict[str, list[float]], seeds: list[int]) -> SimpleNamespace:
+    experiment = config.parse({
+        "title": "Known errors", "seeds": seeds, "budget": {"seconds": 16},
+        "scene": [{"name": "door_ajar", "width": 6, "height": 5}],
+        "method": [{"name": name} for name in errors]}, "known.toml", tmp_path)
+    results = Results(tmp_path / "results" / "known")
+    truth = np.ones((5, 6, 3), np.float32)
+    for cell in experiment.cells():
+        i = seeds.index(cell.seed)
+        error = errors[cell.method.name][i]
+        images = [truth + np.float32(error * np.sqrt(16 / t)) for t in TIMES]
+        info = {"key": cell.key, "spp": 100 + i, "charged_seconds": 16.0, "train_seconds": 2.0 + i,
+                "render_seconds": 14.0 - i, "compile_seconds": 5.0 if i == 0 else 0.0, "wait_fraction": 0.1 * i,
+                "records": 1000 + i, "bytes_per_record": 256, "particles": 50_000, "invalid_pixels": 0,
+                "mean": 1 + error, "mean_stderr": 0.3}
+        trace = [{"seconds": t, "spp": t} for t in TIMES]
+        results.write_cell(cell.scene.name, cell.method.name, cell.seed, info, trace,
+                           {"mean": images[-1], "variance": truth, "count": truth[..., 0]}, images)
+    reference = Reference(truth, truth.copy(), truth, truth, {"spp_a": 1, "spp_b": 1})
+    return SimpleNamespace(experiment=experiment, results=results, references={"door_ajar": reference})
+
+
+@pytest.fixture()
+def known(tmp_path):
+    return folder(tmp_path, ERRORS, [4, 5, 7])
+
+
+def summarised(known) -> dict:
+    return summary.summarise(known.experiment, known.results, known.references)
+
+
+def test_rows_have_the_agreed_keys_in_the_order_of_the_toml(known):
+    result = summarised(known)
+    assert list(result) == ["schema_version", "rows"] and result["schema_version"] == 1
+    assert [row["method"] for row in result["rows"]] == ["Slow", "Fast"]
+    assert all(list(row) == KEYS for row in result["rows"])
+
+
+def test_figures_over_seeds(known):
+    row = summarised(known)["rows"][0]
+    assert row["seeds"] == [4, 5, 7]
+    assert row["l1"] == pytest.approx(0.5, rel=1e-6)
+    assert row["l1_low"] == pytest.approx(0.41, rel=1e-6) and row["l1_high"] == pytest.approx(0.86, rel=1e-6)
+    assert row["relmse"] == pytest.approx(0.25 / 1.01, rel=1e-6) == row["relmse_trimmed"]
+    assert row["mean"] == pytest.approx(1.6) and row["mean_stderr"] == pytest.approx(0.3 / np.sqrt(3))
+    Y = np.array([1.4, 1.5, 1.9])
+    assert row["work_normalised_variance"] == pytest.approx(16 * Y.var(ddof=1) / (1.001 * Y.mean() ** 2), rel=1e-6)
+    assert (row["train_seconds"], row["render_seconds"]) == (3, 13)
+    assert (row["compile_seconds"], row["wait_fraction"]) == (5, 0.2)
+    assert (row["spp"], row["records"], row["bytes_per_record"], row["particles"]) == (101, 1001, 256, 50_000)
+    assert row["invalid_pixels"] == 0 and isinstance(row["spp"], int)
+
+
+def test_one_seed_has_no_variance_and_json_has_no_nan(tmp_path):
+    known = folder(tmp_path, {"Alone": [0.5]}, [0])
+    result = summarised(known)
+    assert result["rows"][0]["work_normalised_variance"] is None
+    summary.write(result, known.results)
+    written = json.loads((known.results.folder / "summary.json").read_text(), parse_constant=pytest.fail)
+    assert written == result
+    row, = csv.DictReader(io.StringIO((known.results.folder / "table.csv").read_text()))
+    assert list(row) == KEYS and row["work_normalised_variance"] == "" and float(row["l1"]) == result["rows"][0]["l1"]
+
+
+def test_what_a_cell_does_not_know_is_null(known):
+    path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "mean_stderr": None}))
+    assert summarised(known)["rows"][0]["mean_stderr"] is None
+
+
+def test_a_missing_cell_is_named_with_the_command_that_makes_it(known):
+    known.results.remove_cell("door_ajar", "Fast", 5)
+    with pytest.raises(ResultError, match=r"Fast / seed 5 .* is missing; make it with: olpm-bench run .* --results"):
+        summarised(known)
+
+
+def test_a_cell_of_another_configuration_does_not_count(known):
+    path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
+    path.write_text(path.read_text().replace(json.loads(path.read_text())["key"], "0123456789abcdef"))
+    with pytest.raises(ResultError, match=r"door_ajar / Slow / seed 7 .* is of another configuration"):
+        summarised(known)
+
+
+def test_a_missing_reference_is_named_with_the_command_that_makes_it(known):
+    with pytest.raises(ResultError, match="scene door_ajar has no reference; make it with: olpm-bench reference "):
+        summary.summarise(known.experiment, known.results, {})
+
+
+def test_speed_up_over_the_first_method_at_equal_error(known):
+    found = summary.speed_ups(known.experiment, known.results, known.references)
+    assert list(found) == ["Fast"]
+    interval = found["Fast"]["door_ajar"]
+    assert interval.value == pytest.approx(4, rel=1e-4) and interval.low == pytest.approx(4, rel=1e-4)
+    console = Console(file=io.StringIO(), width=120)
+    summary.print_speed_ups(found, "Slow", console)
+    assert console.file.getvalue() == "door_ajar / Fast: 4x (4-4) as fast as Slow at equal L1\n"
+
+
+def test_error_curve_of_any_metric_over_samples(known):
+    cells = summary.complete_cells(known.experiment, known.results)["door_ajar", "Slow"]
+    curve = summary.error_curve(cells, known.references["door_ajar"], metrics.relmse, over="spp")
+    assert curve.median[-1] == pytest.approx(0.25 / 1.01, rel=1e-6) and curve.times[-1] == 16
+
+
+def test_speed_ups_over_scenes_are_averaged_where_all_are_known():
+    known, bounded = statistics.Interval(2, 1.5, 2.5), statistics.Interval(8, 7, 9, ">")
+    console = Console(file=io.StringIO())
+    found = {"A": {"x": known, "y": known._replace(value=8)}, "B": {"x": known, "y": bounded}}
+    summary.print_speed_ups(found, "PT", console)
+    assert console.file.getvalue().splitlines() == [
+        "x / A: 2x (1.5-2.5) as fast as PT at equal L1", "y / A: 8x (1.5-2.5) as fast as PT at equal L1",
+        "A: 4x, geometric mean of 2 scenes",
+        "x / B: 2x (1.5-2.5) as fast as PT at equal L1", "y / B: more than 8x as fast as PT at equal L1"]
+
+
+def test_the_table_shows_every_method_and_flags_what_waited(known):
+    console = Console(file=io.StringIO(), width=60)         # narrower than the table: nothing is cut off
+    summary.print_table(summarised(known), console)
+    text = console.file.getvalue()
+    assert "door_ajar" in text and "0.500" in text and "0.410-0.860" in text
+    assert "door_ajar / Slow: waited 20% of its time for a busy core" in text
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (0, "0"), (None, "-"), (float("nan"), "-"), (0.01234, "0.0123"), (1.5, "1.50"), (123.4, "123"), (12345, "12300"),
+    (1e-7, "1.00e-07")])
+def test_numbers_have_three_digits(value, text):
+    assert summary.number(value) == text

@@ -1,0 +1,23 @@
+"""Shared by all tests: a libLLVM that works, the variant, and a clean Dr.Jit between modules."""
+from __future__ import annotations
+
+import representations  # noqa: F401  (selects libLLVM before drjit is imported)
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+
+@pytest.fixture(autouse=True, scope="session")
+def variant() -> str:
+    """Every test runs in the variant that needs no GPU."""
+    mi.set_variant("llvm_ad_rgb")
+    return mi.variant()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def clean_drjit():
+    """Free cached kernels' memory and pending work of the module before."""
+    yield
+    dr.sync_thread()
+    dr.flush_malloc_cache()

@@ -1,0 +1,121 @@
+"""The convergence figure: what it shows, and that it refuses to draw what is not there."""
+from __future__ import annotations
+
+import itertools
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from skimage.io import imread
+
+from olpm_bench.bench import statistics
+from olpm_bench.bench.results import ResultError
+from olpm_bench.report import figures
+
+TIMES = np.geomspace(1, 16, 9)
+
+
+def panel(levels: dict[str, float], floor: float = 0.0, budget: float = 16) -> figures.Panel:
+    curves = {name: statistics.common_curve([TIMES] * 3, [level * k / np.sqrt(TIMES) for k in (0.9, 1, 1.2)])
+              for name, level in levels.items()}
+    return figures.Panel("scene", curves, dict.fromkeys(list(levels)[1:], 1.5), budget, floor)
+
+
+def drawn(*panels: figures.Panel) -> matplotlib.figure.Figure:
+    with figures.style():
+        figure = figures.draw(panels, "time [s], training included", "Title", "Note.")
+        figure.set_dpi(matplotlib.rcParams["savefig.dpi"])
+        FigureCanvasAgg(figure).draw()
+    return figure
+
+
+def visible_texts(figure) -> list:
+    return [text for text in figure.findobj(matplotlib.text.Text) if text.get_text() and text.get_visible()]
+
+
+@pytest.mark.parametrize("levels", [
+    {"Path tracing": 1.0}, {"A": 1.0, "B": 0.99, "C": 0.98, "D": 0.97, "E": 0.2},
+    {"A very long name of a method": 1, "B": 0.1}])
+@pytest.mark.parametrize("floor", [0.0, 1e-5, 0.02, 0.1])
+def test_no_text_overlaps_another_or_leaves_the_figure(levels, floor):
+    figure = drawn(panel(levels, floor), panel(levels, floor))
+    renderer = figure.canvas.get_renderer()
+    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in visible_texts(figure)]
+    width, height = figure.canvas.get_width_height()
+    for text, box in boxes:
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height, f"{text!r} is cut off"
+    for (text, box), (other, other_box) in itertools.combinations(boxes, 2):
+        assert not box.padded(-0.5).overlaps(other_box.padded(-0.5)), f"{text!r} lies on {other!r}"
+
+
+def test_methods_differ_in_colour_and_in_marker_and_in_dash():
+    with figures.style():
+        styles = list(matplotlib.rcParams["axes.prop_cycle"])
+    for key in ("color", "marker", "linestyle"):
+        assert len({str(style[key]) for style in styles}) == len(styles) >= 8
+
+
+def test_a_panel_shows_medians_band_floor_slope_and_training():
+    figure = drawn(panel({"Path tracing": 1.0, "GMM": 0.5}, floor=0.05))
+    axes = figure.axes[0]
+    assert {"Path tracing", "GMM", "noise of the reference", "slope \N{MINUS SIGN}1/2"} <= {
+        text.get_text() for text in visible_texts(figure)}
+    assert len(axes.collections) == 2                                   # bands
+    solid = [line for line in axes.lines if line.get_transform() == axes.transData and len(line.get_xdata()) > 9]
+    np.testing.assert_allclose(solid[0].get_ydata(), 1 / np.sqrt(solid[0].get_xdata()))
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["1", "2", "5", "10", "16"]
+    in_axes = [line for line in axes.lines if line.get_transform() == axes.transAxes]
+    slope = next(line for line in in_axes if line.get_color() == figures.GREY)
+    (x0, y0), (x1, y1) = np.log(axes.transData.inverted().transform(axes.transAxes.transform(slope.get_xydata())))
+    assert (y1 - y0) / (x1 - x0) == pytest.approx(-0.5)
+    triangle = next(line for line in in_axes if line.get_marker() == "^" and line.get_ydata()[0] < 0.05)
+    (x, _), = axes.transData.inverted().transform(axes.transAxes.transform(triangle.get_xydata()))
+    assert x == pytest.approx(1.5)
+
+
+def test_curves_near_the_noise_of_the_reference_are_faint():
+    axes = drawn(panel({"A": 1.0}, floor=0.25)).axes[0]
+    clear = next(line for line in axes.lines if np.isnan(line.get_ydata()).any())
+    assert np.nanmin(clear.get_ydata()) >= figures.NEAR_FLOOR * 0.25
+
+
+@pytest.mark.parametrize(("low", "high", "end", "expected"), [
+    (0.6, 15.5, 15, [1, 2, 5, 10, 15]), (0.6, 60, 60, [1, 10, 60]), (9, 16, 15, [10, 15]),
+    (0.01, 0.3, None, [0.01, 0.02, 0.05, 0.1, 0.2])])
+def test_ticks_are_few_and_round(low, high, end, expected):
+    found = figures.ticks(low, high, end)
+    assert set(expected) <= set(found) and len(found) <= 7 and found == sorted(found)
+
+
+def test_tick_labels_are_plain_numbers():
+    assert [figures.tick_label(x) for x in (15, 0.02, 0.0005, 600)] == ["15", "0.02", "0.0005", "600"]
+    assert figures.tick_label(2e-5) == r"$2\cdot 10^{-5}$" and figures.tick_label(1e-5) == "$10^{-5}$"
+
+
+def test_spread_moves_as_little_as_needed():
+    assert figures.spread([0.1, 0.9, 0.5], 0.1) == pytest.approx([0.1, 0.9, 0.5])
+    assert figures.spread([0.5, 0.5], 0.2) == pytest.approx([0.4, 0.6])
+    moved = np.array(figures.spread([0.3, 0.31, 0.32, 0.9], 0.1))
+    assert np.diff(moved).min() >= 0.1 - 1e-12 and moved[3] == 0.9 and moved[:3].mean() == pytest.approx(0.31)
+
+
+def test_from_a_results_folder(finished):
+    figures.curves(finished.results, finished.experiment, finished.references)
+    assert imread(finished.results.folder / "figure.png").std() > 10
+    assert (finished.results.folder / "figure.pdf").read_bytes().startswith(b"%PDF")
+    note = figures.caption(finished.experiment, {"cpu": "Abacus 2", "threads": 2})
+    assert note == ("Median and 5\N{EN DASH}95 % band of 3 seeds. Time includes training; triangles mark its end. "
+                    "Abacus 2, 2 threads.")
+
+
+def test_refuses_to_draw_with_a_missing_cell_and_names_the_command(finished):
+    finished.results.remove_cell("door_ajar", "Quick & dirty", 1)
+    with pytest.raises(ResultError, match=r"Quick & dirty / seed 1 .* is missing; make it with: olpm-bench run "):
+        figures.curves(finished.results, finished.experiment, finished.references)
+    assert not (finished.results.folder / "figure.png").exists()
+
+
+def test_refuses_to_draw_without_a_reference_and_names_the_command(finished):
+    with pytest.raises(ResultError, match="scene door_ajar has no reference; make it with: olpm-bench reference "):
+        figures.curves(finished.results, finished.experiment, {})

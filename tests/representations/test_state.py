@@ -1,0 +1,57 @@
+"""What can be done with a state whose meaning is unknown."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conformance import batch, lobes, states_equal
+
+import representations
+from representations.state import append, bytes_of, from_numpy, to_numpy
+
+
+@dataclass
+class Toy:
+    mean: mi.Float          # [n_records * 2]
+    count: mi.UInt32        # [n_records]
+
+
+def toy(first: int, n: int) -> Toy:
+    return Toy(mean=dr.arange(mi.Float, 2 * n) + first, count=dr.arange(mi.UInt32, n) + first)
+
+
+def test_append() -> None:
+    a, b = toy(0, 2), toy(10, 1)
+    both = append(a, b)
+    assert np.array_equal(both.mean, [0, 1, 2, 3, 10, 11]) and np.array_equal(both.count, [0, 1, 10])
+    assert len(a.count) == 2 and len(b.count) == 1
+
+
+def test_bytes() -> None:
+    assert bytes_of(toy(0, 3)) == 3 * (2 * 4 + 4)
+
+
+def test_numpy_round_trip() -> None:
+    state = toy(5, 4)
+    arrays = to_numpy(state)
+    assert arrays["mean"].dtype == np.float32 and arrays["count"].dtype == np.uint32
+    assert states_equal(from_numpy(toy(0, 1), arrays), state)
+
+
+def test_missing_field() -> None:
+    with pytest.raises(KeyError, match="count"):
+        from_numpy(toy(0, 1), {"mean": np.zeros(2, np.float32)})
+
+
+@pytest.mark.parametrize("name", ["cosine", "gaussian_mixture", "hey", "jensen"])
+def test_every_representation_has_such_a_state(name: str) -> None:
+    """Flat arrays whose length is a multiple of the number of records, and that survive a file."""
+    representation = representations.create(name)
+    rng = np.random.default_rng(0)
+    state = representation.update(representation.init(3), batch([(lobes(n, rng), np.ones(n)) for n in (200, 0, 20)]))
+    arrays = to_numpy(state)
+    assert all(a.ndim == 1 and len(a) % 3 == 0 for a in arrays.values())
+    assert states_equal(from_numpy(representation.init(1), {k: a.copy() for k, a in arrays.items()}), state)

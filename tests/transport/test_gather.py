@@ -1,0 +1,85 @@
+"""Which particles a record learns from."""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import box, grey
+
+from olpm_bench.transport.cache import RecordCache
+from olpm_bench.transport.gather import MIN_COSINE, MIN_ELEVATION, binned, nearest
+from olpm_bench.transport.particles import emit_photons, trace
+from olpm_bench.transport.training import surface_bounds
+
+
+@pytest.fixture(scope="module")
+def landed():
+    scene = mi.load_dict(box(grey(0.7), ball={"type": "sphere", "radius": 0.4, "bsdf": grey(0.7)},
+                             light={"type": "point", "position": [0.6, 0.2, 0.4], "intensity": 1.0}), optimize=False)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 30_000)
+    particles = trace(scene, emit_photons(scene, sampler), sampler, None, 0.5, 6, mi.TransportMode.Importance)
+    cache = RecordCache(surface_bounds(scene), 0.06)
+    p, _, _, _, n = particles.read(particles.place)
+    cache.grow(p, n, mi.Bool(True))
+    return cache, particles
+
+
+def _key(record, weight):
+    return sorted(zip(record.tolist(), weight.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("neighbours", [20, 250, 5000])
+def test_nearest_are_the_nearest(landed, neighbours):
+    """Against NumPy: the k smallest distances among those within the radius whose direction and normal fit."""
+    cache, particles = landed
+    batch = nearest(cache, particles, neighbours)
+    p, weight, d, _, n = (np.atleast_2d(a.numpy()).T for a in particles.read(particles.place))
+    offset = batch.offset.numpy()
+    for record in range(0, len(cache), 37):
+        centre, normal = cache.points[record, :3], cache.points[record, 3:]
+        d2 = ((p - centre) ** 2).sum(1)
+        usable = np.flatnonzero((d2 < cache.radius ** 2) & (d @ normal >= MIN_ELEVATION) & (n @ normal >= MIN_COSINE))
+        expected = usable[np.argsort(d2[usable], kind="stable")[:neighbours]]
+        rows = slice(offset[record], offset[record + 1])
+        assert rows.stop - rows.start == len(expected)
+        # Equal but for swaps among particles whose distances differ by less than the key's resolution.
+        got = np.sort(batch.weight.numpy()[rows])
+        different = np.setxor1d(got, weight[expected, 0])
+        assert len(different) <= 2
+        wo = mi.Frame3f(mi.Normal3f(*map(float, normal))).to_local(mi.Vector3f(d[expected].T)).numpy().T
+        assert np.abs(np.sort(batch.wo.numpy().T[rows, 2]) - np.sort(wo[:, 2])).max() < (1e-5 if not len(different) else 2)
+
+
+def test_binned_are_those_that_look_the_record_up(landed):
+    cache, particles = landed
+    p, _, d, _, n = particles.read(particles.place)
+    record, normal, valid = cache.lookup(p, n, mi.Bool(True))
+    valid &= dr.dot(d, normal) >= MIN_ELEVATION
+    found = np.bincount(record.numpy()[valid.numpy()], minlength=len(cache))
+    everything = binned(cache, particles, 10 ** 6)
+    np.testing.assert_array_equal(everything.count().numpy(), found)
+    few = binned(cache, particles, 50)
+    np.testing.assert_array_equal(few.count().numpy(), np.minimum(found, 50))
+    assert np.all(np.diff(few.record.numpy().astype(int)) >= 0)
+    # Those kept stand for those left out: the weight of all records stays, up to the noise of the choice.
+    total = dr.sum(everything.weight)[0]
+    assert dr.sum(few.weight)[0] == pytest.approx(total, rel=0.02)
+
+
+@pytest.mark.parametrize("gather", [binned, nearest])
+def test_directions_are_in_the_frame_of_the_record(landed, gather):
+    cache, particles = landed
+    batch = gather(cache, particles, 250)
+    np.testing.assert_allclose(dr.norm(batch.wo).numpy(), 1, atol=1e-5)
+    assert dr.min(batch.wo.z)[0] >= MIN_ELEVATION * 0.99
+    assert len(batch.offset) == len(cache) + 1 and batch.offset.numpy()[-1] == len(batch)
+
+
+@pytest.mark.parametrize("gather", [binned, nearest])
+def test_same_particles_same_batch(landed, gather):
+    cache, particles = landed
+    a, b = (gather(cache, particles, 100) for _ in range(2))
+    for field in ("weight", "distance", "record", "offset"):
+        np.testing.assert_array_equal(getattr(a, field).numpy(), getattr(b, field).numpy())

@@ -1,0 +1,130 @@
+"""The unguided loop is Mitsuba's `path`; the guided one has the same expectation whatever the guide has learnt."""
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import assert_same_expectation, box, furnace, grey, lamp, passes, wall
+
+import olpm_bench
+import representations
+from olpm_bench.transport import settings
+from olpm_bench.transport.training import Training
+
+TRAINING = {"passes": 2, "photons": 20_000, "importons": 10_000, "record_radius": 0.08}
+DEPTH = 8
+
+
+def _texture():
+    image = np.random.default_rng(3).random((8, 8, 3)).astype(np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True}
+
+
+def _normal_map():
+    image = np.random.default_rng(4).normal(0.5, 0.08, (8, 8, 3)).astype(np.float32)
+    image[..., 2] = 0.95
+    return {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True}
+
+
+BSDFS = {
+    "glossy": lambda: {"type": "roughconductor", "alpha": 0.15},
+    "plastic": lambda: {"type": "plastic"},
+    "textured": lambda: {"type": "twosided", "bsdf": {"type": "roughplastic", "diffuse_reflectance": _texture()}},
+    "glass": lambda: {"type": "dielectric"},
+    "rough glass": lambda: {"type": "roughdielectric", "alpha": 0.3},
+    "masked": lambda: {"type": "mask", "opacity": 0.6, "bsdf": {"type": "twosided", "bsdf": grey(0.7)}},
+    "blend": lambda: {"type": "blendbsdf", "weight": 0.4, "a": {"type": "conductor"}, "b": grey(0.6)},
+    "normal map": lambda: {"type": "normalmap", "normalmap": _normal_map(), "bsdf": {"type": "roughconductor", "alpha": 0.3}},
+    "principled": lambda: {"type": "principled", "roughness": 0.4, "spec_trans": 0.4, "eta": 1.4},
+}
+
+
+def _scene(bsdf) -> mi.Scene:
+    """A box with a lamp that shines upwards, a sphere and a tilted panel of the BSDF under test."""
+    one_sided = bsdf["type"] in ("roughconductor", "plastic", "blendbsdf", "normalmap")
+    panel_bsdf = {"type": "twosided", "bsdf": bsdf} if one_sided else bsdf
+    return mi.load_dict(box(grey(0.6), lamp=lamp(),
+                            sphere={"type": "sphere", "center": [-0.35, 0.3, -0.5], "radius": 0.4, "bsdf": bsdf},
+                            panel=wall((0.5, 0.5, -0.4), (-0.5, -0.7, 0.5), 0.35, bsdf=panel_bsdf)))
+
+
+@pytest.fixture(scope="module")
+def mitsuba_path():
+    return mi.load_dict({"type": "path", "max_depth": DEPTH})
+
+
+@pytest.mark.parametrize("name", BSDFS)
+def test_guided_and_unguided_agree_with_mitsuba(name, mitsuba_path):
+    scene = _scene(BSDFS[name]())
+    expected = passes(scene, mitsuba_path, seed=1000)
+    assert_same_expectation(passes(scene, olpm_bench.integrator(max_depth=DEPTH)), expected)
+    guide = olpm_bench.train(scene, "gaussian_mixture", max_depth=DEPTH, **TRAINING)
+    for roulette in ("none", "throughput"):
+        guided = olpm_bench.integrator(guide, max_depth=DEPTH, roulette=roulette)
+        assert_same_expectation(passes(scene, guided, seed=2000), expected)
+
+
+EMITTERS = {
+    "area": lambda: wall((0.3, 0.4, 0.7), (0, 0, -1), 0.2,
+                         emitter={"type": "area", "radiance": {"type": "rgb", "value": 5.0}}),
+    "point": lambda: {"type": "point", "position": [0.3, 0.4, 0.6], "intensity": 1.0},
+    "spot": lambda: {"type": "spot", "intensity": 5.0, "cutoff_angle": 40.0,
+                     "to_world": mi.ScalarTransform4f().look_at((0.3, 0.4, 0.6), (0, 0.5, -1), (0, 1, 0))},
+    "directional": lambda: {"type": "directional", "direction": [0.2, 0.4, -1.0], "irradiance": 2.0},
+    "constant": lambda: {"type": "constant", "radiance": 1.0},
+    "envmap": lambda: {"type": "envmap",
+                       "bitmap": mi.Bitmap(np.random.default_rng(5).random((8, 16, 3)).astype(np.float32) ** 4)},
+    "sunsky": lambda: {"type": "sunsky", "sun_direction": [0.2, -0.3, 0.9]},
+}
+
+
+@pytest.mark.parametrize("name", EMITTERS)
+def test_every_emitter_trains_and_agrees(name, mitsuba_path):
+    """An open box: the walls but without the ceiling, so that light from outside comes in."""
+    content = box(grey(0.7), emitter=EMITTERS[name]())
+    del content["wall5"]                        # the ceiling
+    scene = mi.load_dict(content, optimize=False)      # merged rectangles lose the bounds that distant emitters need
+    guide = olpm_bench.train(scene, "gaussian_mixture", max_depth=DEPTH, **TRAINING)
+    assert guide.particles > 1000
+    assert_same_expectation(passes(scene, olpm_bench.integrator(guide, max_depth=DEPTH)), passes(scene, mitsuba_path, seed=1000))
+
+
+@pytest.mark.parametrize("representation", representations.names())
+@pytest.mark.parametrize("garbage", [False, True])
+def test_furnace(representation, garbage):
+    """Radiance 1 / (1 - a) everywhere, whatever the guide believes."""
+    albedo = 0.5
+    scene = furnace(albedo)
+    guide = Training(scene, representation, settings.training(**TRAINING), max_depth=DEPTH)
+    for _ in guide.run():
+        pass
+    guide = guide.radiance
+    if garbage:
+        _teach_garbage(guide)
+    image = passes(scene, olpm_bench.integrator(guide, max_depth=40, rr_depth=8), n=16, spp=256)
+    assert np.isfinite(image).all() and (image >= 0).all()
+    mean, error = image.mean(), image.mean((1, 2, 3)).std(ddof=1) / 4
+    assert abs(mean - 1 / (1 - albedo)) < 4 * error + 1e-4
+    exact = 1 / (1 - albedo) + np.random.default_rng(0).normal(0, 1e-3, image.shape)
+    assert_same_expectation(image, exact)
+
+
+def _teach_garbage(guide):
+    """A batch of particles that has nothing to do with the light: one random direction a record, of wild weights."""
+    from representations.interface import ParticleBatch
+    rng = np.random.default_rng(9)
+    n, each = guide.records, 100
+    lobe = rng.normal(size=(n, 1, 3)) + 0.1 * rng.normal(size=(n, each, 3))
+    lobe[..., 2] = np.abs(lobe[..., 2])
+    wo = (lobe / np.linalg.norm(lobe, axis=-1, keepdims=True)).reshape(-1, 3)
+    guide.learn(ParticleBatch.from_arrays(mi.Vector3f(wo.T), mi.Float(rng.lognormal(0, 2, n * each)),
+                                          mi.UInt32(np.repeat(np.arange(n), each)), n), seed=1)
+
+
+def test_max_depth(mitsuba_path):
+    """Depth counts as in Mitsuba: 1 shows emitters, 2 adds direct light."""
+    scene = mi.load_dict(box(grey(0.7), lamp=lamp()))
+    for depth in (1, 2, 3):
+        ours, theirs = (mi.render(scene, integrator=i, spp=256, seed=s).numpy().mean() for s, i in enumerate(
+            (olpm_bench.integrator(max_depth=depth), mi.load_dict({"type": "path", "max_depth": depth}))))
+        assert ours == pytest.approx(theirs, rel=0.02)

@@ -1,0 +1,148 @@
+"""The schedule: what is learnt, in constant memory, without recompiling, and the same each time."""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import box, grey, lamp
+
+import olpm_bench
+import representations
+from olpm_bench.transport import settings
+from olpm_bench.transport.guide import Guide
+from olpm_bench.transport.training import Training, train
+from representations import state as states
+
+SMALL = settings.training(passes=3, photons=20_000, importons=10_000, record_radius=0.08)
+DEPTH = 6
+
+
+@pytest.fixture(scope="module")
+def scene() -> mi.Scene:
+    return mi.load_dict(box(grey(0.6), lamp=lamp()))
+
+
+def _arrays(guide: Guide) -> dict[str, np.ndarray]:
+    return states.to_numpy(guide.state) | {"points": guide.cache.points, "count": guide.count.numpy()}
+
+
+@pytest.mark.parametrize("name", representations.names())
+def test_guides_learn_on_line(scene, name):
+    seen = []
+    guide = train(scene, name, SMALL, max_depth=DEPTH, on_pass=seen.append)
+    assert [s.index for s in seen] == [0, 1, 2]
+    assert all(s.stored > 10_000 and 0 < s.kept <= s.stored for s in seen)
+    assert guide.particles == sum(s.kept for s in seen)
+    assert guide.records == seen[-1].records > 100
+    assert np.mean(guide.count.numpy() >= 40) > 0.8
+
+
+@pytest.mark.parametrize("name", ["jensen", "gaussian_mixture"])
+def test_training_repeats_bit_for_bit_whatever_the_threads(scene, name):
+    threads = dr.thread_count()
+    try:
+        results = []
+        for count in (1, 2):
+            dr.set_thread_count(count)
+            results.append(_arrays(train(scene, name, SMALL, max_depth=DEPTH, seed=4)))
+    finally:
+        dr.set_thread_count(threads)
+    for key, value in results[0].items():
+        np.testing.assert_array_equal(value, results[1][key], err_msg=key)
+
+
+def test_seeds_differ(scene):
+    a, b = (train(scene, "jensen", SMALL, max_depth=DEPTH, seed=s) for s in (0, 1))
+    assert a.records != b.records or not np.array_equal(a.cache.points, b.cache.points)
+
+
+def test_no_kernel_is_compiled_after_warm_up(scene):
+    """Counts, seeds, sizes and pass numbers are data, not code."""
+    training = Training(scene, "gaussian_mixture", settings.with_changes(SMALL, {"passes": 6}), DEPTH)
+    passes = training.run()
+    for _ in range(3):
+        next(passes)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        for _ in passes:
+            pass
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert len(history) > 0
+    assert [k for k in history if not k["cache_hit"]] == []
+
+
+def test_memory_is_constant(scene):
+    """The state is as large after many passes as after two: nothing of the particles stays."""
+    training = Training(scene, "gaussian_mixture", settings.with_changes(SMALL, {"passes": 12}), DEPTH)
+    size = []
+    for _ in training.run():
+        size.append(states.bytes_of(training.radiance.state) / training.radiance.records)
+    assert size[-1] == pytest.approx(size[1], rel=1e-6)
+    assert training.radiance.records < 1.02 * training.radiance.cache.cells.size
+
+
+def test_single_batch_is_one_unguided_fit(scene):
+    seen = []
+    single = settings.with_changes(SMALL, {"schedule": "single_batch"})
+    guide = train(scene, "jensen", single, max_depth=DEPTH, on_pass=seen.append)
+    assert len(seen) == 1 and seen[0].photons == 60_000 and seen[0].importons == 0
+    assert guide.count.numpy().max() <= SMALL.neighbours
+
+
+def test_no_passes_leave_the_bsdf(scene):
+    guide = train(scene, "gaussian_mixture", settings.with_changes(SMALL, {"passes": 0}), max_depth=DEPTH)
+    a, b = (mi.render(scene, integrator=olpm_bench.integrator(g, max_depth=DEPTH), spp=8, seed=3) for g in (guide, None))
+    assert guide.records == 0
+    np.testing.assert_array_equal(a.numpy(), b.numpy())
+
+
+def test_guides_are_saved_and_loaded(scene, tmp_path):
+    guide = train(scene, {"type": "gaussian_mixture", "components": 4}, SMALL, max_depth=DEPTH)
+    guide.save(tmp_path / "guide.npz")
+    again = Guide.load(tmp_path / "guide.npz")
+    assert repr(again) == repr(guide) and again.bytes_per_record == guide.bytes_per_record
+    a, b = (mi.render(scene, integrator=olpm_bench.integrator(g, max_depth=DEPTH), spp=8, seed=1).numpy() for g in (guide, again))
+    np.testing.assert_array_equal(a, b)
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"broken.npz: not a guide file"):
+        Guide.load(tmp_path / "broken.npz")
+
+
+def test_plugin_trains_once_a_scene(scene):
+    olpm_bench.register()
+    plugin = mi.load_dict({"type": "guided_path", "representation": "jensen", "passes": 1, "photons": 5_000, "importons": 0,
+                           "record_radius": 0.1, "max_depth": DEPTH})
+    first = mi.render(scene, integrator=plugin, spp=4)
+    guide = plugin.guide
+    dr.eval(first)
+    mi.render(scene, integrator=plugin, spp=4, seed=1)
+    assert plugin.guide is guide and guide.particles > 0
+    other = mi.load_dict(box(grey(0.5), lamp=lamp()))
+    mi.render(other, integrator=plugin, spp=4)
+    assert plugin.guide is not guide
+
+
+@pytest.mark.parametrize(("given", "message"), [
+    ({"passes": -1}, "passes = -1: must be >= 0"),
+    ({"roulete": "none"}, "representation 'gaussian_mixture' has no parameter 'roulete'"),
+    ({"representation": "gmmm"}, "unknown representation 'gmmm'"),
+    ({"preset": "slow"}, "unknown preset 'slow'"),
+])
+def test_plugin_refuses_bad_parameters(given, message):
+    olpm_bench.register()
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "guided_path", **given})
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda s: s.pop("lamp"), "the scene has no emitter"),
+    (lambda s: s.pop("sensor"), "the scene has no camera"),
+    (lambda s: s.update(fog={"type": "sphere", "radius": 0.2, "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}),
+     "participating medium"),
+])
+def test_scenes_that_cannot_be_traced_are_refused(change, message):
+    content = box(grey(0.6), lamp=lamp())
+    change(content)
+    with pytest.raises(ValueError, match=message):
+        train(mi.load_dict(content), "jensen", SMALL, max_depth=DEPTH)
