@@ -11,11 +11,18 @@ from __future__ import annotations
 
 import importlib
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from representations import _llvm
-
-_llvm.select()          # before the first `import drjit` of the process
+try:
+    import representations  # noqa: F401  (points Dr.Jit at a libLLVM that works, before the first `import drjit`)
+except ImportError as error:
+    # Our command line, a module of this package, could not catch it; whoever imports us as a library can.
+    called = Path(sys.argv[0]).stem == "olpm-bench" or "olpm_bench.cli" in sys.orig_argv
+    if not called or type(error).__name__ != "LLVMError":
+        raise
+    print(f"olpm-bench: {error}", file=sys.stderr)
+    raise SystemExit(2) from None
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -30,13 +37,14 @@ def register() -> None:
     """Make the Mitsuba plugin `guided_path`; call it after `mi.set_variant`, and again after a change of variant.
 
     Raises:
-        ValueError: the variant is not one in which guiding works.
+        InputError: the variant is not one in which guiding works.
     """
     global _registered
     import mitsuba as mi
     variant = mi.variant()
     if variant not in ("llvm_ad_rgb", "cuda_ad_rgb"):
-        raise ValueError(f"Mitsuba variant '{variant}': guiding needs llvm_ad_rgb or cuda_ad_rgb; call mi.set_variant first")
+        from olpm_bench.transport.settings import InputError
+        raise InputError(f"Mitsuba variant '{variant}': guiding needs llvm_ad_rgb or cuda_ad_rgb; call mi.set_variant first")
     for name in ("olpm_bench.transport.path", "olpm_bench.transport.plugin"):
         if name in sys.modules and _registered not in (None, variant):
             importlib.reload(sys.modules[name])         # the base class belongs to a variant

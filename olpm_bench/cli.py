@@ -14,6 +14,10 @@ from typing import Annotated, Any
 
 import typer
 
+from olpm_bench.transport.settings import InputError
+from representations import RepresentationError
+from representations._llvm import LLVMError
+
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
@@ -42,18 +46,21 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
         previous = signal.signal(signal.SIGTERM, _interrupt)
         try:
             body(*args, **kwargs)
+        except (typer.Exit, typer.Abort):
+            raise
         except (KeyboardInterrupt, RuntimeError) as error:
-            from olpm_bench.bench.progress import is_interrupt
-            if isinstance(error, typer.Exit) or not is_interrupt(error):
+            from olpm_bench.bench.progress import is_interrupt, reason
+            if is_interrupt(error):
+                complain("interrupted; what is complete is kept, and the same command goes on from there")
+                raise typer.Exit(INTERRUPTED) from None
+            if isinstance(error, NotImplementedError | RecursionError):
                 raise
-            complain("interrupted; what is complete is kept, and the same command goes on from there")
-            raise typer.Exit(INTERRUPTED) from None
+            complain(reason(error))         # of Mitsuba or Dr.Jit, or an image that cannot be used
+            raise typer.Exit(FAILED) from None
         except OSError as error:
             complain(": ".join(str(p) for p in (error.filename, error.strerror or error) if p))
             raise typer.Exit(BAD_INPUT) from None
-        except (ValueError, ImportError) as error:
-            if isinstance(error, ImportError) and type(error).__name__ != "LLVMError":
-                raise
+        except (InputError, RepresentationError, LLVMError) as error:
             complain(str(error))
             raise typer.Exit(BAD_INPUT) from None
         finally:
@@ -115,13 +122,8 @@ def reference(experiment: ExperimentFile, results: ResultsFolder = Path("results
     loaded = _load(experiment, scene)
     environment.select_variant()
     from olpm_bench.bench import reference as references
-    from olpm_bench.bench.run import CellFailedError
 
-    try:
-        references.improve(loaded, results, seconds)
-    except CellFailedError as error:
-        complain(str(error))
-        raise typer.Exit(FAILED) from None
+    references.improve(loaded, results, seconds)
 
 
 @command
@@ -142,19 +144,14 @@ def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedd
     from olpm_bench.bench import environment
 
     if save_guide is not None and load_guide is not None:
-        raise ValueError("give either --save-guide or --load-guide")
+        raise InputError("give either --save-guide or --load-guide")
     environment.select_variant(threads)
     from olpm_bench.bench import render_one
     from olpm_bench.bench.results import plain
-    from olpm_bench.bench.run import CellFailedError
 
     spec = render_one.cell(scene, method, set_, seconds=seconds, spp=spp, width=width, height=height,
-                           max_depth=max_depth, seed=seed)
-    try:
-        done = render_one.render(spec, out, save_guide=save_guide, load_guide=load_guide)
-    except CellFailedError as error:
-        complain(str(error))
-        raise typer.Exit(FAILED) from None
+                           max_depth=max_depth, seed=seed, load_guide=load_guide)
+    done = render_one.render(spec, out, save_guide=save_guide, load_guide=load_guide)
     print(json.dumps(plain(done), allow_nan=False))
 
 
@@ -178,7 +175,9 @@ def fit(representation: Annotated[str, typer.Option(metavar="NAME", show_default
 
 
 @command
-def perf() -> None:
+def perf(scene: Annotated[str, typer.Option(metavar="NAME|FILE.xml", help="What is rendered and trained on.")] = "door_ajar",
+         width: Annotated[int, typer.Option(min=1)] = 160, height: Annotated[int, typer.Option(min=1)] = 90,
+         passes: Annotated[int, typer.Option(min=3, help="Training passes; timed from the third on.")] = 20) -> None:
     """Measure what the targets are about; prints one JSON object."""
     from olpm_bench.bench import environment
 
@@ -186,7 +185,7 @@ def perf() -> None:
     from olpm_bench.bench import perf as performance
     from olpm_bench.bench.results import plain
 
-    print(json.dumps(plain(performance.measure()), allow_nan=False))
+    print(json.dumps(plain(performance.measure(scene, width, height, passes=passes)), allow_nan=False))
 
 
 @command

@@ -16,6 +16,7 @@ import importlib.metadata
 import importlib.util
 import inspect
 import sys
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -45,13 +46,16 @@ def find(name: str) -> Any:
     """The class behind a registered name or behind ``path/to/file.py:ClassName`` (which runs that file).
 
     Raises:
-        RepresentationError: no such name, file or class.
+        RepresentationError: no such name, file or class, or one whose code cannot be loaded.
     """
     if name in BUILT_IN:
         module, _, attribute = BUILT_IN[name].partition(":")
         return getattr(importlib.import_module(module), attribute)
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
-        return entry.load()
+        try:
+            return entry.load()
+        except Exception as error:      # other people's code
+            raise RepresentationError(f"representation '{name}', entry point {entry.value}, {_reason(error)}") from error
     if ".py:" in name:
         file, _, attribute = name.rpartition(":")
         return _from_file(Path(file), attribute)
@@ -67,14 +71,35 @@ def create(type: str, **parameters: Any) -> Any:
         RepresentationError: unknown name; unknown, missing or invalid hyper-parameter.
     """
     cls = find(type)
-    known = list(inspect.signature(cls).parameters)
-    for key in parameters:
+    known = inspect.signature(cls).parameters
+    for key, value in parameters.items():
         if key not in known:
             raise RepresentationError(f"representation '{type}' has no parameter '{key}'; known: {', '.join(known) or 'none'}")
+        allowed = wrong_type(value, known[key].default)
+        if allowed:
+            raise RepresentationError(f"representation '{type}': {key} = {value!r}: must be {allowed}")
     try:
         return cls(**parameters)
     except (TypeError, ValueError) as error:
         raise RepresentationError(f"representation '{type}': {error}") from error
+
+
+def wrong_type(value: Any, default: Any) -> str | None:
+    """What a parameter with this default must be, if `value` is not; None also where the default doesn't tell."""
+    if isinstance(default, bool):
+        return None if isinstance(value, bool) else "true or false"
+    if isinstance(default, int):
+        return None if isinstance(value, Integral) and not isinstance(value, bool) else "a whole number"
+    if isinstance(default, float):
+        return None if isinstance(value, Real) and not isinstance(value, bool) else "a number"
+    if isinstance(default, str):
+        return None if isinstance(value, str) else "a string"
+    return None
+
+
+def _reason(error: BaseException) -> str:
+    """In one line, why code cannot be loaded."""
+    return " ".join(f"cannot be loaded: {error.__class__.__name__}: {error}".split())
 
 
 def _from_file(file: Path, attribute: str) -> type:
@@ -85,7 +110,11 @@ def _from_file(file: Path, attribute: str) -> type:
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module           # dataclasses look their module up by name
-    spec.loader.exec_module(module)
-    if not hasattr(module, attribute):
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:                  # other people's code
+        sys.modules.pop(module_name, None)
+        raise RepresentationError(f"representation file {file} {_reason(error)}") from error
+    if not inspect.isclass(getattr(module, attribute, None)):
         raise RepresentationError(f"representation file {file} has no class '{attribute}'")
     return getattr(module, attribute)

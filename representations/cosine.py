@@ -37,6 +37,8 @@ class CosineLobe:
         return CosineState(dr.zeros(mi.UInt32, n_records))
 
     def update(self, state: CosineState, batch: ParticleBatch, seed: int = 0) -> CosineState:
+        if batch.n_records != len(state.count):
+            raise ValueError(f"a batch of {batch.n_records} records for a state of {len(state.count)}")
         return CosineState(state.count + batch.count())
 
     def sample(self, state: CosineState, record: mi.UInt32, sample1: mi.Float, sample2: mi.Point2f,

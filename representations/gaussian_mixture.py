@@ -60,7 +60,7 @@ class GaussianMixture:
 
     def __init__(self, components: int = 8, alpha: float = 0.7, a: float = 2.01, b: float = 5e-5, v: float = 1.01,
                  eigenvalue_floor: float = 1e-7, first_fit: int | None = None, max_sweeps: int = 20,
-                 tolerance: float = 1e-3, weight_clamp: float = 10, start_variance: float = 0.01) -> None:
+                 tolerance: float = 1e-3, weight_clamp: float = 10.0, start_variance: float = 0.01) -> None:
         first_fit = 10 * components if first_fit is None else first_fit
         for name, value, ok, allowed in (
                 ("components", components, 1 <= components <= 64, "in 1 .. 64"),
@@ -69,7 +69,7 @@ class GaussianMixture:
                 ("b", b, 0 < b < math.inf, "> 0"),
                 ("v", v, 1 <= v < math.inf, ">= 1"),
                 ("eigenvalue_floor", eigenvalue_floor, 1e-10 <= eigenvalue_floor <= 0.1, "in [1e-10, 0.1]"),
-                ("first_fit", first_fit, first_fit >= 1, ">= 1"),
+                ("first_fit", first_fit, isinstance(first_fit, int) and first_fit >= 1, "a whole number >= 1"),
                 ("max_sweeps", max_sweeps, max_sweeps >= 1, ">= 1"),
                 ("tolerance", tolerance, 0 <= tolerance < 1, "in [0, 1)"),
                 ("weight_clamp", weight_clamp, weight_clamp > 1, "> 1"),
@@ -106,10 +106,14 @@ class GaussianMixture:
         begin = dr.gather(mi.UInt32, batch.offset, record)
         count = dr.gather(mi.UInt32, batch.offset, record + 1) - begin
         trained = state.visits > 0
+        # Point and weight side by side: one load a particle instead of four gathers
+        s = square.from_hemisphere(batch.wo)
+        points = dr.ravel(mi.Vector4f(s.x, s.y, batch.weight, 0))
+        dr.eval(points)
 
         def particle(i: mi.UInt32) -> Particle:
-            s = square.from_hemisphere(dr.gather(mi.Vector3f, batch.wo, begin + i))
-            return s.x, s.y, dr.gather(mi.Float, batch.weight, begin + i)
+            p = dr.gather(mi.Vector4f, points, begin + i)
+            return p.x, p.y, p.z
 
         new = replace(state, lobes=dr.empty(mi.Float, len(state.lobes)), moments=dr.empty(mi.Float, len(state.moments)),
                       mean_weight=dr.empty(mi.Float, n), visits=dr.empty(mi.UInt32, n))
@@ -153,7 +157,7 @@ class GaussianMixture:
             return (dr.select(old, w.x, p.x), dr.select(old, w.y, p.y),
                     dr.select(old, w.z, dr.gather(mi.Float, batch.weight, fresh, ~old)))
 
-        state_bits, stream_bits = mi.sample_tea_32(record, dr.opaque(mi.UInt32, seed))
+        state_bits, stream_bits = mi.sample_tea_32(record, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), rounds=8)
         rng = mi.PCG32(initstate=mi.UInt64(state_bits), initseq=mi.UInt64(stream_bits))
         fit = self.em.first_fit(particle, stored + dr.gather(mi.UInt32, count, record),
                                 mi.Float(dr.gather(mi.UInt32, seen, record)), rng)

@@ -19,6 +19,8 @@ from typing import Protocol, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from representations import RepresentationError
+
 State = TypeVar("State")
 
 
@@ -47,15 +49,20 @@ class ParticleBatch:
         return dr.gather(mi.UInt32, self.offset, record + 1) - dr.gather(mi.UInt32, self.offset, record)
 
     @staticmethod
+    def empty(n_records: int) -> ParticleBatch:
+        """No particles at all."""
+        return ParticleBatch(mi.Vector3f(), mi.Float(), mi.Float(), mi.UInt32(), dr.zeros(mi.UInt32, n_records + 1))
+
+    @staticmethod
     def from_arrays(wo: mi.Vector3f, weight: mi.Float, record: mi.UInt32, n_records: int,
                     distance: mi.Float | None = None) -> ParticleBatch:
         """Group particles by record with a stable sort; entries with ``record >= n_records`` are left out.
 
         Raises:
-            ValueError: a direction or weight is not finite, or a weight is negative.
+            RepresentationError: a direction or weight is not finite, or a weight is negative.
         """
-        if not dr.all(dr.isfinite(weight) & (weight >= 0) & dr.all(dr.isfinite(wo)), axis=None):
-            raise ValueError("particles with a NaN, infinite or negative weight or direction")
+        if len(weight) and not dr.all(dr.isfinite(weight) & (weight >= 0) & dr.all(dr.isfinite(wo))):
+            raise RepresentationError("particles with a NaN, infinite or negative weight or direction")
         order, record, offset = group(record, n_records)
         batch = ParticleBatch(
             wo=dr.gather(mi.Vector3f, wo, order), weight=dr.gather(mi.Float, weight, order),
@@ -70,13 +77,28 @@ def group(key: mi.UInt32, n_keys: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]
 
     The entries of key k are ``order[offset[k]] .. order[offset[k + 1] - 1]``, in their original order.
     """
-    count = dr.zeros(mi.UInt32, n_keys + 1)
-    dr.scatter_add(count, mi.UInt32(1), key, key < dr.opaque(mi.UInt32, n_keys))     # a literal would recompile
-    offset = dr.prefix_sum(count)
+    if len(key) == 0:
+        return mi.UInt32(), mi.UInt32(), dr.zeros(mi.UInt32, n_keys + 1)
     order = dr.argsort(key)
+    key = dr.gather(mi.UInt32, key, order)
+    offset = offsets(key, n_keys)
     inside = dr.arange(mi.UInt32, int(offset[n_keys]))      # the keys left out are at the end
-    order = dr.gather(mi.UInt32, order, inside)
-    return order, dr.gather(mi.UInt32, key, order), offset
+    return dr.gather(mi.UInt32, order, inside), dr.gather(mi.UInt32, key, inside), offset
+
+
+def offsets(key: mi.UInt32, n_keys: int) -> mi.UInt32:
+    """Where each key begins in an ascending array [n_keys + 1]; entries with ``key >= n_keys`` do not count.
+
+    Each run of equal keys writes where it begins and ends; counting by `scatter_add` would compile n_keys into a kernel.
+    """
+    i, last = dr.arange(mi.UInt32, len(key)), dr.opaque(mi.UInt32, len(key) - 1)
+    before = dr.gather(mi.UInt32, key, dr.maximum(i, 1) - 1)
+    after = dr.gather(mi.UInt32, key, dr.minimum(i + 1, last))
+    inside = key < dr.opaque(mi.UInt32, n_keys)
+    begin, end = dr.zeros(mi.UInt32, n_keys + 1), dr.zeros(mi.UInt32, n_keys + 1)
+    dr.scatter(begin, i, key, inside & ((i == 0) | (before != key)))
+    dr.scatter(end, i + 1, key, inside & ((i == last) | (after != key)))
+    return dr.prefix_sum(end - begin)
 
 
 class DirectionalPdf(Protocol[State]):

@@ -27,7 +27,7 @@ Particles: TypeAlias = "Callable[[mi.UInt32], Particle]"            # particle i
 
 INITIAL_VISITS = 100        # what the initial mixture counts for, in particles: with 0 it is forgotten in ten [M]
 M_STEP_EVERY = 10           # an M-step after the very first particle would put all means on it [M]
-UNROLLED = 2                # particles in one turn of the innermost loop: a quarter faster than one
+UNROLLED = 2
 CLAMP_ROUNDS = 4            # fixed-point iterations for the mean of clamped weights
 WIDE_VARIANCE = 0.1         # of the one wide component of the initial mixture
 EXPONENT = 0.5 / dr.log(2)  # exp(-d^2 / 2) = 2^(-EXPONENT d^2)

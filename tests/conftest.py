@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import representations  # noqa: F401  (selects libLLVM before drjit is imported)
 
+# isort: split
 import drjit as dr
 import mitsuba as mi
 import pytest

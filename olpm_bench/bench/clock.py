@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 TASKS = Path("/proc/self/task")
+WAITED = 0.05       # share of its wall time spent waiting above which a cell is flagged: its machine was busy
 WORKED = 0.01       # a thread worked in a lap if it ran at least this share of the busiest thread's time
 
 

@@ -14,6 +14,7 @@ import inspect
 import json
 import math
 import os
+import shlex
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +26,6 @@ from pydantic import (
     ConfigDict,
     Field,
     PrivateAttr,
-    TypeAdapter,
     ValidationError,
     field_validator,
     model_validator,
@@ -33,13 +33,14 @@ from pydantic import (
 
 import representations
 from olpm_bench import scenes as embedded
+from olpm_bench import transport
 from olpm_bench.bench.results import SCHEMA_VERSION, slug
-from olpm_bench.transport.settings import PRESETS, IntegratorSettings, TrainingSettings
+from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes, without_preset
 
 MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see run.pass_seed
 
 
-class ConfigError(ValueError):
+class ConfigError(InputError):
     """A mistake in an experiment file or on the command line; one line that says what is allowed."""
 
 
@@ -171,10 +172,10 @@ class CellSpec:
 
     @functools.cached_property
     def key(self) -> str:
-        """Hash of everything that determines the cell: change any of it and the cell is redone."""
+        """Hash of everything that determines the cell, our code included: change any of it and the cell is redone."""
         config = {k: v for k, v in self.config().items() if k not in ("scene", "file", "method")}      # labels
         return _hash({**config, "scene": self.scene.digest(), "code": _representation_code(self.method),
-                      "mitsuba": importlib.metadata.version("mitsuba"), "schema_version": SCHEMA_VERSION})
+                      "own_code": own_code(), "mitsuba": importlib.metadata.version("mitsuba"), "schema_version": SCHEMA_VERSION})
 
     def __str__(self) -> str:
         return f"{self.scene.name} / {self.method.name} / seed {self.seed}"
@@ -224,12 +225,7 @@ class Experiment(Table):
     @field_validator("training", mode="before")
     @classmethod
     def _preset(cls, value: Any) -> Any:
-        if not isinstance(value, dict) or "preset" not in value:
-            return value
-        preset = value["preset"]
-        if preset not in PRESETS:
-            raise ValueError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
-        return {**PRESETS[preset], **{k: v for k, v in value.items() if k != "preset"}}
+        return without_preset(value) if isinstance(value, dict) else value
 
     @model_validator(mode="after")
     def _distinct(self) -> Experiment:
@@ -252,19 +248,20 @@ class Experiment(Table):
         changes = dict(method.integrator)
         if scene.max_depth is not None:
             changes["max_depth"] = scene.max_depth
-        return _changed(self.integrator, changes, f"method {method.name!r} integrator")
+        try:
+            return with_changes(self.integrator, changes)
+        except InputError as error:
+            raise InputError(f"method {method.name!r} integrator: {error}") from None
 
     def training_of(self, method: Method) -> TrainingSettings | None:
         """The method's training; None if it has no representation.  Its own `preset` starts from that preset."""
         if method.representation is None:
             return None
-        changes, where = dict(method.training), f"method {method.name!r} training"
-        if "preset" in changes:
-            preset = changes.pop("preset")
-            if preset not in PRESETS:
-                raise ValueError(f"{where}: unknown preset {preset!r}; known: {', '.join(PRESETS)}")
-            return _changed(TrainingSettings(**PRESETS[preset]), changes, where)
-        return _changed(self.training, changes, where)
+        start = TrainingSettings() if "preset" in method.training else self.training
+        try:
+            return with_changes(start, without_preset(method.training))
+        except InputError as error:
+            raise InputError(f"method {method.name!r} training: {error}") from None
 
     def cells(self) -> list[CellSpec]:
         """Every cell in the order of running: methods innermost, so that they share the machine's good and bad
@@ -342,13 +339,16 @@ def load(path: Path | str, scenes: dict[str, Path] | None = None) -> Experiment:
         raise ConfigError(f"experiment file {path}: cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not valid TOML: {error}") from None
-    experiment = parse(data, path.name, path.parent, scenes)
+    experiment = parse(data, path.name, path.parent, scenes or {})
     experiment._path = path
     return experiment
 
 
 def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Path] | None = None) -> Experiment:
     """Check what a TOML holds; `source` names it in messages, `folder` is what its paths are relative to.
+
+    Args:
+        scenes: as for :func:`load`; None where there is no option that replaces them.
 
     Raises:
         ConfigError: as :func:`load`.
@@ -361,7 +361,7 @@ def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Pat
     except ValidationError as error:
         raise ConfigError(_explain(error, source)) from None
     for scene in experiment.scene:
-        _check_scene(scene, source)
+        _check_scene(scene, source, replaceable=scenes is not None)
     for method in experiment.method:
         try:
             method.create()
@@ -399,12 +399,12 @@ def _replace_scenes(data: dict[str, Any], scenes: dict[str, Path], source: str) 
         known[name]["file"] = str(Path(file).resolve())
 
 
-def _check_scene(scene: Scene, source: str) -> None:
+def _check_scene(scene: Scene, source: str, replaceable: bool) -> None:
     where = f"{source} [[scene]] {scene.name!r}"
+    hint = f"; --scene {shlex.quote(scene.name)}=PATH points it elsewhere" if replaceable else ""
     if scene.file is not None:
         if not scene.file.is_file():
-            raise ConfigError(f"{where}: file {scene.file}: there is no such file; "
-                              f"--scene {scene.name}=PATH points it elsewhere")
+            raise ConfigError(f"{where}: file {scene.file}: there is no such file{hint}")
         if scene.parameters:
             raise ConfigError(f"{where}: parameters belong to embedded scenes; a file takes overrides")
     else:
@@ -419,20 +419,6 @@ def _check_scene(scene: Scene, source: str) -> None:
             raise ConfigError(f"{where}: {error}") from None
     if scene.reference is not None and not scene.reference.exists():
         raise ConfigError(f"{where}: reference {scene.reference}: there is no such file or folder")
-
-
-def _changed(settings: Any, changes: dict[str, Any], where: str) -> Any:
-    """`settings` with some fields changed and everything checked again."""
-    known = [f.name for f in dataclasses.fields(settings)]
-    for key in changes:
-        if key not in known:
-            raise ValueError(f"{where}: unknown key '{key}'; known: {', '.join(known)}")
-    try:
-        data = json.dumps({**dataclasses.asdict(settings), **changes})
-        return TypeAdapter(type(settings)).validate_json(data, strict=True)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise ValueError(f"{where}: {' '.join([*map(str, first['loc']), _plain(first)])}") from None
 
 
 TABLES = {"budget": Budget, "scene": Scene, "method": Method,
@@ -462,6 +448,8 @@ def _explain(error: ValidationError, source: str) -> str:
         return f"unknown key '{keys[-1]}' in {where}; known: {', '.join(known)}"
     if first["type"] in ("missing", "missing_argument"):
         return f"missing key '{keys[-1]}' in {where}" if keys else f"missing table '{table}' in {source}"
+    if not keys and table is not None and not isinstance(first["input"], dict):     # the table itself is none
+        where, keys = source, [where.removeprefix(source).strip()]
     name = ".".join(str(k) for k in keys)
     return f"{where}: {name + ' ' if name else ''}{_plain(first)}"
 
@@ -472,7 +460,7 @@ def _plain(error: Any) -> str:
         text = str(error["ctx"]["error"])
         scalar = isinstance(error["input"], (int, float, str)) and text.startswith("must")
         return f"= {error['input']!r}: {text}" if scalar else text
-    message = error["msg"].replace("Input should be", "must be")
+    message = error["msg"].replace("Input should be", "must be").replace("an object", "a table")
     return f"= {error['input']!r}: {message}" if not isinstance(error["input"], dict) else message
 
 
@@ -488,6 +476,13 @@ def _representation_defaults(method: Method) -> dict[str, Any] | None:
 
 def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+@functools.cache
+def own_code() -> str:
+    """Hash of the sources of path tracing, training and representations, so that figures never mix versions."""
+    folders = (Path(package.__path__[0]) for package in (transport, representations))
+    return _hash([[f.name, f.read_text(encoding="utf-8")] for folder in folders for f in sorted(folder.glob("*.py"))])
 
 
 def _representation_code(method: Method) -> str | None:

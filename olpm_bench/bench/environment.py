@@ -10,6 +10,7 @@ from typing import Any
 
 from olpm_bench.bench.clock import cores
 from olpm_bench.bench.results import SCHEMA_VERSION
+from olpm_bench.transport.settings import InputError
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 VARIANT_VARIABLE = "OLPM_BENCH_VARIANT"
@@ -19,15 +20,15 @@ def select_variant(threads: int | None = None) -> str:
     """Set the Mitsuba variant that `OLPM_BENCH_VARIANT` names (llvm_ad_rgb by default), and the number of threads.
 
     Raises:
-        ValueError: a variant in which the guided path tracer does not work; a thread count below 1.
+        InputError: a variant in which the guided path tracer does not work; a thread count below 1.
         LLVMError: no usable libLLVM.
     """
     variant = os.environ.get(VARIANT_VARIABLE, VARIANTS[0])
     if variant not in VARIANTS:
-        raise ValueError(f"{VARIANT_VARIABLE}={variant}: the guided path tracer works on unpolarised RGB, vectorised; "
+        raise InputError(f"{VARIANT_VARIABLE}={variant}: the guided path tracer works on unpolarised RGB, vectorised; "
                          f"must be one of {', '.join(VARIANTS)}")
     if threads is not None and threads < 1:
-        raise ValueError(f"--threads {threads}: must be >= 1")
+        raise InputError(f"--threads {threads}: must be >= 1")
     if variant.startswith("llvm"):
         from representations import _llvm
         _llvm.require()

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench.transport.settings import InputError
 from representations import square
 from representations import state as states
 from representations.interface import DirectionalPdf, ParticleBatch
@@ -43,12 +44,12 @@ def fit(representation: DirectionalPdf[Any], samples: Path, heldout: Path, batch
     Means are weighted by the held-out weights.
 
     Raises:
-        ValueError: a file or array that is missing, or is not what it has to be.
+        InputError: a file or array that is missing, or is not what it has to be.
     """
     wo, weight = _load(samples, "wo", "weight")
     heldout_wo, heldout_weight, truth = _load(heldout, "wo", "weight", "pdf")
     if not 1 <= batches <= len(wo):
-        raise ValueError(f"batches = {batches}: must be in 1 .. {len(wo)}, the number of directions in {samples}")
+        raise InputError(f"batches = {batches}: must be in 1 .. {len(wo)}, the number of directions in {samples}")
     parts = []
     for part in np.array_split(np.arange(len(wo)), batches):
         direction = mi.Vector3f(np.ascontiguousarray(wo[part].T, np.float32))
@@ -59,7 +60,7 @@ def fit(representation: DirectionalPdf[Any], samples: Path, heldout: Path, batch
 
     integral = _integral(representation, state)
     if not integral > 0:
-        raise ValueError(f"the fitted density integrates to {integral}, so it can't be normalised")
+        raise InputError(f"the fitted density integrates to {integral}, so it can't be normalised")
     p_fit = _pdf(representation, state, heldout_wo) / integral
     q = 0.5 * heldout_wo[:, 2] / np.pi + 0.5 * p_fit
     share = heldout_weight / heldout_weight.sum()
@@ -109,36 +110,36 @@ def _integral(representation: DirectionalPdf[Any], state: Any) -> float:
 def _load(file: Path, *names: str) -> list[np.ndarray]:
     """Arrays of an .npz file, checked and as float64."""
     if not Path(file).is_file():
-        raise ValueError(f"{file}: there is no such file")
+        raise InputError(f"{file}: there is no such file")
     try:
         with np.load(file, allow_pickle=False) as archive:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("it holds a single array")
             missing = [name for name in names if name not in archive.files]
             if missing:
-                raise ValueError(f"no array '{missing[0]}'; it has {', '.join(archive.files) or 'none'}, "
+                raise InputError(f"no array '{missing[0]}'; it has {', '.join(archive.files) or 'none'}, "
                                  f"but {', '.join(names)} are needed")
             arrays = [np.asarray(archive[name], np.float64) for name in names]
     except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise ValueError(f"{file}: not an .npz file of directions: {error}") from error
+        raise InputError(f"{file}: not an .npz file of directions: {error}") from error
     n = len(arrays[0]) if arrays[0].ndim else 0
     for name, array in zip(names, arrays, strict=True):
         shape = (n, 3) if name == "wo" else (n,)
         if array.shape != shape or n == 0:
-            raise ValueError(f"{file}: array '{name}' has shape {array.shape}; must be {'(n, 3)' if name == 'wo' else '(n,)'} "
+            raise InputError(f"{file}: array '{name}' has shape {array.shape}; must be {'(n, 3)' if name == 'wo' else '(n,)'} "
                              f"with n = {n or '1 or more'}")
         if not np.isfinite(array).all():
-            raise ValueError(f"{file}: array '{name}' has {np.count_nonzero(~np.isfinite(array))} NaN or infinite entries")
+            raise InputError(f"{file}: array '{name}' has {np.count_nonzero(~np.isfinite(array))} NaN or infinite entries")
         if name != "wo" and array.min() < 0:
-            raise ValueError(f"{file}: array '{name}' has {np.count_nonzero(array < 0)} negative entries")
+            raise InputError(f"{file}: array '{name}' has {np.count_nonzero(array < 0)} negative entries")
     by_name = dict(zip(names, arrays, strict=True))
     if by_name["weight"].sum() <= 0:
-        raise ValueError(f"{file}: array 'weight' is zero everywhere")
+        raise InputError(f"{file}: array 'weight' is zero everywhere")
     wo = by_name["wo"]
     stray = np.abs(np.linalg.norm(wo, axis=1) - 1) > 1e-3
     if stray.any():
-        raise ValueError(f"{file}: array 'wo' has {np.count_nonzero(stray)} vectors that are not of unit length")
+        raise InputError(f"{file}: array 'wo' has {np.count_nonzero(stray)} vectors that are not of unit length")
     if wo[:, 2].min() <= 0:
         below = np.count_nonzero(wo[:, 2] <= 0)
-        raise ValueError(f"{file}: array 'wo' has {below} directions below the horizon; must have z > 0")
+        raise InputError(f"{file}: array 'wo' has {below} directions below the horizon; must have z > 0")
     return arrays

@@ -16,16 +16,17 @@ import numpy as np
 import psutil
 
 import representations
+from olpm_bench.bench.run import Kernels
 from olpm_bench.scenes.load import load
 from olpm_bench.transport import settings as options
 from olpm_bench.transport.guide import Guide
-from olpm_bench.transport.path import GuidedPathIntegrator
-from olpm_bench.transport.settings import IntegratorSettings
 from olpm_bench.transport.training import Training
 from representations.interface import ParticleBatch
 
 REPEATS = 5
 MAX_DEPTH = 13
+PARTICLES: dict[str, Any] = {"photons": 300_000, "importons": 100_000}      # of a training pass
+RECORDS, EACH = 4096, 256                                   # of the on-line update: records, particles of each
 
 
 def measure(scene: str = "door_ajar", width: int = 160, height: int = 90, spp: int = 32, passes: int = 20) -> dict[str, Any]:
@@ -34,17 +35,18 @@ def measure(scene: str = "door_ajar", width: int = 160, height: int = 90, spp: i
     Args:
         scene: embedded name or Mitsuba XML on which vertices and training passes are timed.
         spp: samples a pixel of the timed renders.
-        passes: training passes with the mixture, of 100k importons and 300k photons; timed from the third on.
+        passes: training passes with the mixture, of `PARTICLES`; at least 3, timed from the third on.
     """
     loaded = load(scene, width=width, height=height, max_depth=MAX_DEPTH)
-    figures: dict[str, Any] = {"scene": scene, "em_ns_per_particle": em_ns_per_particle()}
+    figures: dict[str, Any] = {"scene": scene, "width": width, "height": height, "em_ns_per_particle": em_ns_per_particle()}
+    training_passes(loaded, 4, "binned")            # compiles what can be: also what only passes without new records do
     guide, seconds, misses, rss = training_passes(loaded, passes, "binned")
     figures |= {"pass_seconds": seconds, "recompiles_after_warmup": misses, "rss_mb_by_pass": rss}
-    figures["pass_seconds_nearest"] = training_passes(loaded, 5, "nearest")[1]
+    figures["pass_seconds_nearest"] = training_passes(loaded, min(passes, 5), "nearest")[1]
     guides: dict[str, Guide | None] = {"unguided": None, "gaussian_mixture": guide}
     for name in representations.names():
         if name not in guides:
-            training = Training(loaded, name, options.training(passes=3), MAX_DEPTH)
+            training = Training(loaded, name, options.training(passes=3, **PARTICLES), MAX_DEPTH)
             for _ in training.run():
                 pass
             guides[name] = training.radiance
@@ -57,15 +59,15 @@ def measure(scene: str = "door_ajar", width: int = 160, height: int = 90, spp: i
     return figures
 
 
-def em_ns_per_particle(records: int = 4096, each: int = 256) -> float:
+def em_ns_per_particle() -> float:
     """One on-line update of the default mixture, all records trained before [CPU ns a particle]."""
     rng = np.random.default_rng(0)
-    wo = rng.normal(size=(records * each, 3)) * (0.3, 0.3, 0.1) + (0.4, 0.2, 0.8)
+    wo = rng.normal(size=(RECORDS * EACH, 3)) * (0.3, 0.3, 0.1) + (0.4, 0.2, 0.8)
     wo[:, 2] = np.abs(wo[:, 2])
     batch = ParticleBatch.from_arrays(mi.Vector3f((wo / np.linalg.norm(wo, axis=1, keepdims=True)).T), dr.ones(mi.Float, len(wo)),
-                                      mi.UInt32(np.repeat(np.arange(records), each)), records)
+                                      mi.UInt32(np.repeat(np.arange(RECORDS), EACH)), RECORDS)
     mixture = representations.create("gaussian_mixture")
-    states = [mixture.update(mixture.init(records), batch)]
+    states = [mixture.update(mixture.init(RECORDS), batch)]
     dr.eval(states)
 
     def update() -> None:
@@ -78,35 +80,36 @@ def em_ns_per_particle(records: int = 4096, each: int = 256) -> float:
 
 def training_passes(scene: mi.Scene, passes: int, gather: str) -> tuple[Guide, dict[str, float], int, list[float]]:
     """Train a mixture: the guide, median wall seconds of a pass by part, kernels compiled after pass 2, memory by pass."""
-    training = Training(scene, "gaussian_mixture", options.training(passes=passes, gather=gather), MAX_DEPTH)
-    seconds, misses, rss = [], 0, []
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
+    training = Training(scene, "gaussian_mixture", options.training(passes=passes, gather=gather, **PARTICLES), MAX_DEPTH)
+    seconds, rss, warm_up = [], [], 0
+    with Kernels.watched() as kernels:
         for statistics in training.run():
-            compiled = sum(not kernel["cache_hit"] for kernel in dr.kernel_history([dr.KernelType.JIT]))
-            if statistics.index >= 2:
-                misses += compiled
+            kernels.compiled()
+            if statistics.index < 2:
+                warm_up = kernels.count
+            else:
                 seconds.append(statistics.seconds)
             rss.append(psutil.Process().memory_info().rss / 2 ** 20)
     median = {part: float(np.median([s[part] for s in seconds])) for part in seconds[0]}
     median["total"] = float(np.median([sum(s.values()) for s in seconds]))
-    return training.radiance, median, misses, rss
-
-
-class _VertexCounter(GuidedPathIntegrator):
-    """Renders the number of vertices of each path."""
-
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        _, valid, vertices = self.walk(scene, sampler, ray, active)
-        return mi.Spectrum(mi.Float(vertices)), valid, []
+    return training.radiance, median, kernels.count - warm_up, rss
 
 
 def vertex_cost(scene: mi.Scene, guides: dict[str, Guide | None], spp: int) -> dict[str, float]:
     """CPU ns a path vertex of the path tracer with each guide, without roulette."""
-    settings = IntegratorSettings(max_depth=MAX_DEPTH, roulette="none")
+    from olpm_bench.transport.path import GuidedPathIntegrator  # whose base class exists once a variant is set
+
+    class VertexCounter(GuidedPathIntegrator):
+        """Renders the number of vertices of each path."""
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            _, valid, vertices = self.walk(scene, sampler, ray, active)
+            return mi.Spectrum(mi.Float(vertices)), valid, []
+
+    settings = options.IntegratorSettings(max_depth=MAX_DEPTH, roulette="none")
     integrators = {name: GuidedPathIntegrator(settings, guide) for name, guide in guides.items()}
     pixels = int(np.prod(scene.sensors()[0].film().crop_size()))
-    vertices = {name: _render(scene, _VertexCounter(settings, guide), 8, 0).mean() * pixels * spp
+    vertices = {name: float(_render(scene, VertexCounter(settings, guide), 8, 0).mean()) * pixels * spp
                 for name, guide in guides.items()}
     times: dict[str, list[float]] = {name: [] for name in guides}
     for repeat in range(REPEATS + 1):

@@ -20,6 +20,16 @@ def is_interrupt(error: BaseException | None) -> bool:
     return error is not None
 
 
+def reason(error: BaseException) -> str:
+    """What an error of Mitsuba or Dr.Jit says, in one line, and what its causes say, which Dr.Jit leaves out."""
+    found: list[str] = []
+    cause: BaseException | None = error
+    while cause is not None:
+        found.append(" ".join(str(cause).split()) or type(cause).__name__)
+        cause = cause.__cause__
+    return ": ".join(dict.fromkeys(found))
+
+
 class Bar:
     """Progress of work whose total is known; a context manager.
 

@@ -22,7 +22,7 @@ def settings(assignments: list[str], tables: tuple[str, ...] = TABLES) -> dict[s
     """``["training.passes=5", ...]`` as nested tables; a value is TOML, or else a string.
 
     Raises:
-        ConfigError: not ``table.key=value``, or an unknown table.
+        ConfigError: not ``table.key=value``, an unknown table, or the type of the representation, which has its option.
     """
     found: dict[str, dict[str, Any]] = {table: {} for table in tables}
     for text in assignments:
@@ -32,6 +32,8 @@ def settings(assignments: list[str], tables: tuple[str, ...] = TABLES) -> dict[s
             raise ConfigError(f"--set {text}: must be {tables[0]}.key=value")
         if table not in found:
             raise ConfigError(f"--set {text}: unknown table '{table}'; known: {', '.join(tables)}")
+        if (table, key) == ("representation", "type"):
+            raise ConfigError(f"--set {text}: the type is what --method (of `fit`: --representation) names")
         found[table][key] = parse_value(value.strip())
     return found
 
@@ -46,8 +48,11 @@ def parse_value(text: str) -> Any:
 
 
 def cell(scene: str, method: str, assignments: list[str], *, seconds: float | None, spp: int | None,
-         width: int, height: int, max_depth: int | None, seed: int) -> CellSpec:
+         width: int, height: int, max_depth: int | None, seed: int, load_guide: Path | None = None) -> CellSpec:
     """The cell that the options of `olpm-bench render` describe.
+
+    Args:
+        load_guide: the guide that takes the place of training, which then has nothing to set.
 
     Raises:
         ConfigError: any of them is wrong.
@@ -55,6 +60,10 @@ def cell(scene: str, method: str, assignments: list[str], *, seconds: float | No
     if (seconds is None) == (spp is None):
         raise ConfigError("give either --seconds or --spp, and not both")
     tables = settings(assignments)
+    for table in ("representation", "training"):
+        if load_guide is not None and tables[table]:
+            raise ConfigError(f"--set {table}.{next(iter(tables[table]))}: the guide of --load-guide is trained already; "
+                              "scene.* and integrator.* can be set")
     is_file = scenes.is_file(scene)
     scene_table: dict[str, Any] = {"name": scene, "width": width, "height": height}
     if is_file:
@@ -87,7 +96,7 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
         Timings, counts and versions, for JSON.
 
     Raises:
-        ConfigError, ValueError, SceneError, OSError: wrong options or files; CellFailedError: an invalid image.
+        InputError, OSError: wrong options or files; CellFailedError: an invalid image.
     """
     if out.suffix.lower() != ".exr":
         raise ConfigError(f"--out {out}: must end in .exr")
@@ -102,13 +111,17 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
         bar.at(0.0, "compiling")
         warm = run.warm_up(spec, scene, guide)
         done = run.measure(spec, scene, warm, guide, bar.at)
+    config = spec.config()
+    if guide is not None:
+        config |= {"representation": guide.specification, "training": None}
     if save_guide is not None and done.guide is not None:
         with replacing(save_guide) as beside:
             done.guide.save(beside)
-    write_exr(out, done.image, {**spec.config(), **done.info})
+    info = {k: v for k, v in done.info.items() if k != "key"}
+    write_exr(out, done.image, {**config, **info})
     png = out.with_suffix(".png")
     tonemap.write_png(png, tonemap.srgb(done.image["mean"], tonemap.auto_exposure(done.image["mean"])))
-    return {**{k: v for k, v in done.info.items() if k != "key"}, **spec.config(), "out": str(out), "png": str(png),
+    return {**info, **config, "out": str(out), "png": str(png),
             "guide": str(save_guide or load_guide) if save_guide or load_guide else None, "trace": done.trace,
             "versions": environment.versions(), "variant": mi.variant(), "commit": environment.commit()}
 

@@ -31,10 +31,12 @@ from typing import Any
 
 import numpy as np
 
+from olpm_bench.transport.settings import InputError
+
 SCHEMA_VERSION = 1
 
 
-class ResultError(ValueError):
+class ResultError(InputError):
     """A result that is missing, broken, or of a newer schema; the message names the file and what to do."""
 
 
@@ -342,28 +344,28 @@ class Results:
             config: what goes into the header of the image.
 
         Raises:
-            OSError: cannot be written; what was there is then incomplete, and nothing else is touched.
+            OSError: cannot be written; what was there stays as it was.
         """
         folder = self.cell_folder(scene, method, seed)
-        self.remove_cell(scene, method, seed)
-        write_exr(folder / "image.exr", image, config)
-        write_exr(folder / "checkpoints.exr", {str(i): c for i, c in enumerate(checkpoints)})
-        write_text(folder / "trace.jsonl", "".join(json.dumps(plain(line), allow_nan=False) + "\n" for line in trace))
+        new = folder / f".cell.{socket.gethostname()}-{os.getpid()}.tmp"
         info = plain({"schema_version": SCHEMA_VERSION, "scene": scene, "method": method, "seed": seed, **info})
-        write_json(folder / "cell.json", info)
+        try:
+            write_exr(new / "image.exr", image, config)
+            write_exr(new / "checkpoints.exr", {str(i): c for i, c in enumerate(checkpoints)})
+            write_text(new / "trace.jsonl", "".join(json.dumps(plain(line), allow_nan=False) + "\n" for line in trace))
+            write_json(new / "cell.json", info)
+            (folder / "cell.json").unlink(missing_ok=True)      # an old cell.json never stands beside new images
+            for name in ("image.exr", "checkpoints.exr", "trace.jsonl", "cell.json"):
+                os.replace(new / name, folder / name)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
         (folder / "failed.json").unlink(missing_ok=True)
         return Cell(scene, method, seed, info, trace, folder)
 
     def write_failure(self, scene: str, method: str, seed: int, reason: str) -> None:
-        """Say why a cell is not complete."""
-        self.remove_cell(scene, method, seed)
+        """Say why a cell is not complete.  One of other settings that is there stays."""
         write_json(self.cell_folder(scene, method, seed) / "failed.json",
                    {"schema_version": SCHEMA_VERSION, "scene": scene, "method": method, "seed": seed, "reason": reason})
-
-    def remove_cell(self, scene: str, method: str, seed: int) -> None:
-        """Make a cell incomplete, before it is redone: cell.json goes first."""
-        for name in ("cell.json", "image.exr", "checkpoints.exr", "trace.jsonl"):
-            (self.cell_folder(scene, method, seed) / name).unlink(missing_ok=True)
 
 
 @contextmanager
@@ -380,7 +382,10 @@ def locked(folder: Path) -> Iterator[None]:
     _acquire(path)
     try:
         for left in folder.glob(".*.tmp*"):
-            left.unlink(missing_ok=True)
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
         yield
     finally:
         path.unlink(missing_ok=True)

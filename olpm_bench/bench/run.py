@@ -20,10 +20,10 @@ import mitsuba as mi
 import numpy as np
 
 from olpm_bench.bench import environment
-from olpm_bench.bench.clock import Clock
+from olpm_bench.bench.clock import WAITED, Clock
 from olpm_bench.bench.config import CellSpec, Experiment
 from olpm_bench.bench.metrics import luminance
-from olpm_bench.bench.progress import Bar, is_interrupt
+from olpm_bench.bench.progress import Bar, is_interrupt, reason
 from olpm_bench.bench.results import (
     Accumulator,
     Cell,
@@ -45,14 +45,13 @@ PASSES = 40                 # rendering passes in a budget, at least: so it is m
 SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
 MAX_LANES = 2**24           # paths in flight: about 2 GB
 WARM_UP_PATHS = 20_000      # photons and importons of the training that compiles the kernels
-WAITED = 0.05               # wait fraction from which on a cell is reported
 
 # 32-bit seeds of rendering passes: cells from 0, warm-up from 2^30, reference halves from 2^31 and 3 * 2^30.
 PASSES_PER_SEED = 2**15
 WARM_UP_SEED = 2**30
 
 
-class CellFailedError(Exception):
+class CellFailedError(RuntimeError):
     """A cell that was run and cannot be used; the message is the reason."""
 
 
@@ -117,7 +116,7 @@ def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> Warm
     """Compile every kernel of a cell, with fewer particles: kernels depend on the structure and not on sizes."""
     with Kernels.watched() as kernels:
         if guide is None and spec.training is not None:
-            small = dataclasses.replace(spec.training, passes=min(spec.training.passes, 2),
+            small = dataclasses.replace(spec.training, passes=min(spec.training.passes, 4),
                                         photons=min(spec.training.photons, WARM_UP_PATHS),
                                         importons=min(spec.training.importons, WARM_UP_PATHS))
             guide = _train(spec, scene, small, WARM_UP_SEED)
@@ -377,9 +376,8 @@ def _run_cell(results: Results, spec: CellSpec, scene: mi.Scene, warm: dict[tupl
         except RuntimeError as error:           # of Mitsuba or Dr.Jit: the other cells may still work
             if is_interrupt(error):
                 raise KeyboardInterrupt from error
-            reason = " ".join(str(error).split())
-            results.write_failure(*names, reason)
-            raise CellFailedError(reason) from error
+            results.write_failure(*names, reason(error))
+            raise CellFailedError(reason(error)) from error
         return results.write_cell(*names, done.info, done.trace, done.image, done.checkpoints, spec.config())
 
 

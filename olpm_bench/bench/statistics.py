@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from olpm_bench.transport.settings import InputError
+
 BAND = (5.0, 95.0)          # [%]
 RESAMPLES = 2000
 
@@ -72,18 +74,18 @@ def common_curve(times: Sequence[np.ndarray], errors: Sequence[np.ndarray], n: i
         n: points of the axis.
 
     Raises:
-        ValueError: an input out of that range, or curves without a common time.
+        InputError: an input out of that range, or curves without a common time.
     """
     for t, e in zip(times, errors, strict=True):
         if len(t) != len(e) or not (np.diff(t) > 0).all() or not np.min(t) > 0:
-            raise ValueError(f"times {np.asarray(t).tolist()}: must increase from above 0, one per error")
+            raise InputError(f"times {np.asarray(t).tolist()}: must increase from above 0, one per error")
         if not (np.min(e) > 0 and np.isfinite(e).all()):
-            raise ValueError(f"errors {np.asarray(e).tolist()}: must be positive and finite")
+            raise InputError(f"errors {np.asarray(e).tolist()}: must be positive and finite")
     if all(len(t) == 1 for t in times):
         return Curve(np.median(np.asarray(times, np.float64), axis=0), np.asarray(errors, np.float64))
     start, end = max(t[0] for t in times), min(t[-1] for t in times)
     if start > end:
-        raise ValueError(f"the seeds' curves share no time: one starts at {start:.3g}, another ends at {end:.3g}")
+        raise InputError(f"the seeds' curves share no time: one starts at {start:.3g}, another ends at {end:.3g}")
     at = np.geomspace(start, end, n)
     at[0], at[-1] = start, end      # exactly: rounding must not leave the measured range
     return Curve(at, np.stack([interpolate(t, e, at) for t, e in zip(times, errors, strict=True)]))

@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench import metrics, statistics
-from olpm_bench.bench.results import Cell, Reference, ResultError, Results, plain
+from olpm_bench.bench.clock import WAITED
+from olpm_bench.bench.results import SCHEMA_VERSION, Cell, Reference, ResultError, Results, plain
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from olpm_bench.bench.config import Experiment
 
-SCHEMA_VERSION = 1
-WAITED = 0.05           # wait fraction above which a cell is flagged: its machine was busy
 COLUMNS = ("scene", "method", "seeds", "l1", "l1_low", "l1_high", "relmse", "relmse_trimmed",
            "work_normalised_variance", "mean", "mean_stderr", "train_seconds", "render_seconds", "compile_seconds",
            "wait_fraction", "spp", "records", "bytes_per_record", "particles", "invalid_pixels")

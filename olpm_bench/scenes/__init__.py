@@ -5,7 +5,8 @@
     {'gap': 0.07, 'rotation': 23.7, 'floor_roughness': 0.12}
 
 Each embedded scene is a module of this package whose ``build(**parameters)`` returns a dictionary for
-``mi.load_dict``; its first docstring line is its description, and its ``VERSION`` grows when the image changes.
+``mi.load_dict``, and whose ``check`` of the same parameters refuses values out of their range.  Its first docstring
+line is its description, and its ``VERSION`` grows when the image changes.
 A new one is a file and a word in ``EMBEDDED``.  Nothing here loads Mitsuba: :mod:`olpm_bench.scenes.load` does.
 """
 from __future__ import annotations
@@ -20,10 +21,12 @@ from types import ModuleType
 from typing import Any
 from xml.etree import ElementTree
 
+from olpm_bench.transport.settings import InputError
+
 EMBEDDED = ("door_ajar", "cornell_box")
 
 
-class SceneError(ValueError):
+class SceneError(InputError):
     """A scene that cannot be used; the message is one line: which thing, which value, what is allowed."""
 
 
@@ -42,10 +45,10 @@ def parameters(name: str) -> dict[str, Any]:
 
 
 def resolve(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The parameters of an embedded scene with some changed, every default written out; `build` checks the values.
+    """The parameters of an embedded scene with some changed, every default written out.
 
     Raises:
-        SceneError: no such scene, a parameter it has not, or a value that is no number.
+        SceneError: no such scene, a parameter it has not, or a value that is no number or out of its range.
     """
     known = parameters(name)
     for key, value in (changes or {}).items():
@@ -53,7 +56,9 @@ def resolve(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
             raise SceneError(f"scene '{name}' has no parameter '{key}'; known: {', '.join(known) or 'none'}")
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise SceneError(f"scene '{name}', parameter {key} = {value!r}: must be a number")
-    return {key: float((changes or {}).get(key, default)) for key, default in known.items()}
+    values = {key: float((changes or {}).get(key, default)) for key, default in known.items()}
+    _module(name).check(**values)
+    return values
 
 
 def build(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -73,8 +78,8 @@ def is_file(name_or_path: str | Path) -> bool:
 def digest(name_or_path: str | Path, changes: dict[str, Any] | None = None) -> str:
     """SHA-256 [hex] of all that determines a scene, but for the sensor's size and path depth.
 
-    Embedded: name, version and every parameter.  File: contents of the XML and of the XML files it includes, name
-    and size of the other files it refers to, and the overrides; where the file lies does not matter.
+    Embedded: name, version and every parameter.  File: the overrides, and name and contents of the XML, of those it
+    includes and of the other files it refers to; where the file lies does not matter.
 
     Raises:
         SceneError: no such scene or file, a parameter that the embedded scene has not, or a file that is not XML.
@@ -135,16 +140,21 @@ def substitute(text: str, values: dict[str, str]) -> str:
 
 
 def _file_content(path: Path, overrides: dict[str, str]) -> list[list[Any]]:
-    """[name, hash of an XML file | size of another file (None: missing)] of `path` and of all files it refers to."""
+    """[name, SHA-256 of the contents (None: missing)] of a scene file and of all files it refers to."""
     files = with_includes(path, overrides)
     values = {**xml_parameters(files), **overrides}
-    content: list[list[Any]] = [[f.name, hashlib.sha256(f.read_bytes()).hexdigest()] for f in files]
+    content: list[list[Any]] = [[f.name, _sha256(f)] for f in files]
     for element in (e for root in files.values() for e in root.iter("string")):
         name = substitute(element.get("value", ""), values)
         file = path.parent / name
         if element.get("name") == "filename" or ("." in name and file.is_file()):
-            content.append([name, file.stat().st_size if file.is_file() else None])
+            content.append([name, _sha256(file) if file.is_file() else None])
     return content
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _module(name: str) -> ModuleType:

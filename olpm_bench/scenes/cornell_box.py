@@ -22,10 +22,7 @@ def build(light_size: float = 0.5, rotation: float = 11.3) -> dict[str, Any]:
     Raises:
         SceneError: a value out of its range.
     """
-    if not 0.01 <= light_size <= 1.9:
-        raise SceneError(f"cornell_box: light_size = {light_size!r}: must be in [0.01, 1.9], in metres")
-    if not math.isfinite(rotation):
-        raise SceneError(f"cornell_box: rotation = {rotation!r}: must be finite, in degrees")
+    check(light_size, rotation)
     import mitsuba as mi
 
     from olpm_bench.scenes.geometry import box, mesh, quad, turn_z
@@ -60,3 +57,14 @@ def build(light_size: float = 0.5, rotation: float = 11.3) -> dict[str, Any]:
             "film": {"type": "hdrfilm", "width": 256, "height": 256},
         },
     }
+
+
+def check(light_size: float, rotation: float) -> None:
+    """
+    Raises:
+        SceneError: a value out of its range.
+    """
+    if not 0.01 <= light_size <= 1.9:
+        raise SceneError(f"cornell_box: light_size = {light_size!r}: must be in [0.01, 1.9], in metres")
+    if not math.isfinite(rotation):
+        raise SceneError(f"cornell_box: rotation = {rotation!r}: must be finite, in degrees")

@@ -49,9 +49,7 @@ def build(gap: float = 0.07, rotation: float = 23.7, floor_roughness: float = 0.
     Raises:
         SceneError: a value out of its range.
     """
-    _check(gap, rotation)
-    if not 0.01 <= floor_roughness <= 1:
-        raise SceneError(f"door_ajar: floor_roughness = {floor_roughness!r}: must be in [0.01, 1]")
+    check(gap, rotation, floor_roughness)
     import mitsuba as mi
 
     from olpm_bench.scenes import geometry as g
@@ -77,7 +75,7 @@ def slit(gap: float = 0.07, rotation: float = 23.7) -> np.ndarray:
     Raises:
         SceneError: a value out of its range.
     """
-    _check(gap, rotation)
+    _check_slit(gap, rotation)
     corner = np.array([HINGE + DOOR, LIT])
     _, across = _leaf_axes(gap)
     foot = corner + gap * across
@@ -86,7 +84,17 @@ def slit(gap: float = 0.07, rotation: float = 23.7) -> np.ndarray:
     return points @ turn_z(rotation).T
 
 
-def _check(gap: float, rotation: float) -> None:
+def check(gap: float, rotation: float, floor_roughness: float) -> None:
+    """
+    Raises:
+        SceneError: a value out of its range.
+    """
+    _check_slit(gap, rotation)
+    if not 0.01 <= floor_roughness <= 1:
+        raise SceneError(f"door_ajar: floor_roughness = {floor_roughness!r}: must be in [0.01, 1]")
+
+
+def _check_slit(gap: float, rotation: float) -> None:
     if not 0 <= gap <= DOOR:
         raise SceneError(f"door_ajar: gap = {gap!r}: must be in [0, {DOOR}], the width of the door in metres")
     if not math.isfinite(rotation):

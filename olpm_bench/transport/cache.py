@@ -9,6 +9,8 @@ the best record for them.  A query reads its cell and checks the record it finds
 Records grow where particles land: each newly met cell is represented by the first particle in it; a maximal
 independent set of those that no record covers (no two within R of each other) become records.  All is decided by the
 order of particles and never by the scheduling of threads.
+
+Simpler than the paper: R is the same for all records, and they do not shrink near sources or where lobes are sharp.
 """
 from __future__ import annotations
 
@@ -20,11 +22,15 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from olpm_bench.transport.settings import InputError
+
 MISSING = 0xFFFFFFFF            # cell without a record
 MIN_COSINE = 0.751              # 2 sqrt(1.001 - n.n') <= 1: the largest angle between the normals of point and record [L]
 CELL = 0.5                      # edge of a voxel / validity radius
 REACH = 1 + CELL * 3 ** 0.5     # a cell within R of its record may extend by its own diagonal beyond
 NEIGHBOURS = 8                  # nearest records among which the best for a cell is sought
+LEAST = 2                       # fewer new cells or records wait: Dr.Jit compiles arrays of one entry to other kernels
+MOST_CELLS = 2 ** 27            # of a table: 512 MB
 
 
 @dataclass
@@ -37,9 +43,16 @@ class Grid:
 
     @staticmethod
     def over(bbox: mi.ScalarBoundingBox3f, edge: float) -> Grid:
-        """Voxels of `edge` scene units; a little larger than the box, so that no surface lies on its border."""
+        """Voxels of `edge` scene units; a little larger than the box, so that no surface lies on its border.
+
+        Raises:
+            InputError: more cells than a table may have.
+        """
         low, extent = np.array(bbox.min).ravel() - 0.5 * edge, np.array(bbox.extents()).ravel() + edge
         size = np.maximum(np.ceil(extent / edge), 1).astype(int)
+        if 6 * np.prod(size.astype(float)) > MOST_CELLS:
+            raise InputError(f"records of this radius need a table of {6 * np.prod(size.astype(float)):.1g} cells: "
+                             f"at most {MOST_CELLS:.1g}; make record_radius larger")
         opaque = [dr.opaque(mi.Float, float(x)) for x in low], [dr.opaque(mi.UInt32, int(x)) for x in size]
         return Grid(mi.Point3f(opaque[0]), dr.opaque(mi.Float, 1 / edge), mi.Vector3u(opaque[1]), 6 * int(np.prod(size)))
 
@@ -102,46 +115,50 @@ class RecordCache:
         """Add records for the points in cells that have none; returns how many.  Existing records keep their index."""
         cell = self.grid.cell(p, n)
         new = dr.compress(active & (dr.gather(mi.UInt32, self.table, cell, active) == MISSING))
-        if len(new) == 0:
+        if len(new) < LEAST:
             return 0
         cell = dr.gather(mi.UInt32, cell, new)
         first = dr.full(mi.UInt32, MISSING, self.grid.n_cells)
         dr.scatter_reduce(dr.ReduceOp.Min, first, new, cell)
         cells = dr.compress(first != MISSING)
+        if len(cells) < LEAST:
+            return 0
         representative = dr.gather(mi.UInt32, first, cells)
         points = np.concatenate([dr.gather(mi.Point3f, p, representative).numpy(),
                                  dr.gather(mi.Normal3f, n, representative).numpy()]).T.astype(np.float32)
-        self.cells = np.concatenate([self.cells, cells.numpy()])
-        self.cell_points = np.concatenate([self.cell_points, points])
-        added = points[_independent(points, self._uncovered(points), self.radius)]
+        uncovered = self._best(points)[1] > self.radius
+        added = points[_independent(points, uncovered, self.radius)]
+        known = np.ones(len(points), bool)
+        if len(added) < LEAST:
+            added, known = added[:0], ~uncovered            # their cells stay new
+        # New cells need a record, and so do old ones with an added record near them: it may be better.
+        stale = np.concatenate([_near(self.cell_points, added, self.radius), np.ones(known.sum(), bool)])
+        self.cells = np.concatenate([self.cells, cells.numpy()[known]])
+        self.cell_points = np.concatenate([self.cell_points, points[known]])
         self.points = np.concatenate([self.points, added])
-        self._tabulate()
+        self._tabulate(stale)
         return len(added)
-
-    def _uncovered(self, points: np.ndarray) -> np.ndarray:
-        """Mask of the points that no record covers."""
-        if len(self) == 0:
-            return np.ones(len(points), bool)
-        return self._best(points)[1] > self.radius
 
     def _best(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Per point, the record of smallest error and its distance (inf where no normal fits)."""
         k = min(NEIGHBOURS, len(self))
-        distance, index = cKDTree(self.points[:, :3]).query(points[:, :3], k=[*range(1, k + 1)], workers=-1)
+        if k == 0 or len(points) == 0:
+            return np.zeros(len(points), np.intp), np.full(len(points), np.inf)
+        distance, index = cKDTree(self.points[:, :3]).query(points[:, :3], k=[*range(1, k + 1)], workers=dr.thread_count())
         cosine = np.einsum("ij,ikj->ik", points[:, 3:], self.points[index, 3:])
         error = np.where(cosine >= MIN_COSINE, distance / self.radius + 2 * np.sqrt(np.maximum(1.001 - cosine, 0)), np.inf)
         best = np.argmin(error, axis=1, keepdims=True)
         distance = np.where(np.isfinite(np.take_along_axis(error, best, 1)), np.take_along_axis(distance, best, 1), np.inf)
         return np.take_along_axis(index, best, 1)[:, 0], distance[:, 0]
 
-    def _tabulate(self) -> None:
-        """Enter into each occupied cell the best record for the point that represents it."""
-        record, distance = self._best(self.cell_points)
-        table = dr.full(mi.UInt32, MISSING, self.grid.n_cells)
-        dr.scatter(table, mi.UInt32(np.where(distance <= self.radius, record, MISSING).astype(np.uint32)), mi.UInt32(self.cells))
+    def _tabulate(self, stale: np.ndarray) -> None:
+        """Enter into the `stale` ones of the occupied cells the best record for the point that represents each."""
+        record, distance = self._best(self.cell_points[stale])
+        entry = np.where(distance <= self.radius, record, MISSING).astype(np.uint32)
+        dr.scatter(self.table, mi.UInt32(entry), mi.UInt32(self.cells[stale]))
         rows = np.zeros((len(self), 8), np.float32)
         rows[:, :3], rows[:, 3], rows[:, 4:7] = self.points[:, :3], (REACH * self.radius) ** 2, self.points[:, 3:]
-        self.table, self.rows = table, mi.Float(rows.ravel())
+        self.rows = mi.Float(rows.ravel())
         dr.eval(self.table, self.rows)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
@@ -156,8 +173,15 @@ class RecordCache:
         cache = RecordCache(bbox, float(arrays["record_radius"]))
         cache.points, cache.cells, cache.cell_points = (arrays[k] for k in ("points", "cells", "cell_points"))
         if len(cache):
-            cache._tabulate()
+            cache._tabulate(np.ones(len(cache.cells), bool))
         return cache
+
+
+def _near(points: np.ndarray, others: np.ndarray, radius: float) -> np.ndarray:
+    """Mask of the points with one of the others within `radius`."""
+    if len(points) == 0 or len(others) == 0:
+        return np.zeros(len(points), bool)
+    return np.isfinite(cKDTree(others[:, :3]).query(points[:, :3], distance_upper_bound=radius)[0])
 
 
 def _independent(points: np.ndarray, candidates: np.ndarray, radius: float) -> np.ndarray:

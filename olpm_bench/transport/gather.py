@@ -14,7 +14,8 @@ import mitsuba as mi
 
 from olpm_bench.transport.cache import Grid, RecordCache
 from olpm_bench.transport.particles import Particles
-from representations.interface import ParticleBatch, group
+from olpm_bench.transport.settings import InputError
+from representations.interface import ParticleBatch, group, offsets
 
 MIN_ELEVATION = 1e-3        # dot(d, n): particles that graze the record's horizon are left out [L]
 MIN_COSINE = 0.707          # dot(n', n): and those on surfaces that turn away from it [L]
@@ -27,6 +28,8 @@ def binned(cache: RecordCache, particles: Particles, neighbours: int) -> Particl
     record, normal, valid = cache.lookup(p, n, weight > 0)
     valid &= dr.dot(d, normal) >= MIN_ELEVATION
     order, record, offset = group(dr.select(valid, record, dr.opaque(mi.UInt32, len(cache))), len(cache))
+    if len(order) == 0:
+        return ParticleBatch.empty(len(cache))
     # Of the `found` particles of a record, `kept` evenly spaced ones: where rank * kept steps over a multiple of found.
     found = dr.maximum(dr.gather(mi.UInt32, offset, record + 1) - dr.gather(mi.UInt32, offset, record), 1)
     kept = dr.minimum(found, dr.opaque(mi.UInt32, neighbours))
@@ -48,6 +51,8 @@ def nearest(cache: RecordCache, particles: Particles, neighbours: int) -> Partic
         last |= value << shift
         dr.eval(last, wanted)
     hit, record = candidates.take(last, wanted, neighbours)
+    if len(hit) == 0:
+        return ParticleBatch.empty(len(cache))
     by_path = dr.argsort(hit)               # not by voxel: see Particles
     order, record, _ = group(dr.gather(mi.UInt32, record, by_path), len(cache))
     place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, hit, dr.gather(mi.UInt32, by_path, order)))
@@ -58,13 +63,18 @@ GATHERS = {"binned": binned, "nearest": nearest}
 
 
 def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: mi.UInt32, stands_for: mi.Float) -> ParticleBatch:
-    """A batch of chosen particles, already grouped by record, with directions in the records' frames."""
+    """A batch of chosen particles, already grouped by record, with directions in the records' frames.
+
+    Raises:
+        InputError: a weight is infinite.
+    """
     _, weight, d, distance, _ = particles.read(place)
     frame = mi.Frame3f(cache.row(record)[1])
-    count = dr.zeros(mi.UInt32, len(cache) + 1)
-    dr.scatter_add(count, mi.UInt32(1), record)
-    batch = ParticleBatch(frame.to_local(d), weight * stands_for, distance, record, dr.prefix_sum(count))
-    dr.eval(batch)
+    batch = ParticleBatch(frame.to_local(d), weight * stands_for, distance, record, offsets(record, len(cache)))
+    finite = dr.all(dr.isfinite(batch.weight))
+    dr.eval(batch, finite)
+    if not finite:
+        raise InputError("particles of infinite weight: check the reflectances of the scene's surfaces")
     return batch
 
 
@@ -117,7 +127,7 @@ class _Candidates:
                 key, ok = self.key(i, True)
                 above = ((key ^ last) >> shift) >> DIGIT_BITS == 0
                 digit = (key >> shift) & ((1 << DIGIT_BITS) - 1)
-                dr.scatter_add(counters, mi.UInt32(1), (record << DIGIT_BITS) + digit, ok & above)
+                dr.scatter_add(counters, mi.UInt32(1), (record << DIGIT_BITS) + digit, ok & above, dr.ReduceMode.Direct)
                 i += 1
             run += 1
         dr.eval(counters)

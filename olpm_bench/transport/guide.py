@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 
 import representations
 from olpm_bench.transport.cache import RecordCache
+from olpm_bench.transport.settings import InputError
 from representations import state as states
 from representations.interface import ParticleBatch
 
 FORMAT = 1              # of guide files
-MIN_PARTICLES = 40      # records that have seen fewer leave the surface to its BSDF [L: undersampled below 5 K]
+MIN_PARTICLES = 80      # records that have seen fewer leave the surface to its BSDF; the mixture's first fit needs as many
 
 
 class GuidedPoint:
@@ -27,10 +29,10 @@ class GuidedPoint:
     def __init__(self, guide: Guide, record: mi.UInt32, frame: mi.Frame3f, valid: mi.Bool) -> None:
         self.guide, self.record, self.frame, self.valid = guide, record, frame, valid
 
-    def sample(self, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
-        """A direction distributed by `pdf`; a failed sample lies below the record's horizon."""
+    def sample(self, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Bool]:
+        """A direction distributed by `pdf`, and whether there is one: samples may fail."""
         wo, _ = self.guide.representation.sample(self.guide.state, self.record, sample1, sample2, active & self.valid)
-        return self.frame.to_world(wo)
+        return self.frame.to_world(wo), active & (wo.z > 0)         # failed ones lie below the record's horizon
 
     def pdf(self, d: mi.Vector3f) -> mi.Float:
         """Density of a direction [1/sr]."""
@@ -94,31 +96,33 @@ class Guide:
         arrays |= {f"state.{k}": v for k, v in states.to_numpy(self.state).items()}
         arrays |= {"meta": np.array(json.dumps(meta)), "count": self.count.numpy()}
         with open(path, "wb") as file:
-            np.savez_compressed(file, **arrays)         # type: ignore[arg-type]  (its stub: all keywords are flags)
+            np.savez_compressed(file, **arrays)         # type: ignore[arg-type]
 
     @staticmethod
     def load(path: str | Path) -> Guide:
         """Read a guide.
 
         Raises:
-            ValueError: not a guide file, or one of a newer format.
+            InputError: not a whole guide file, or one of a newer format.
+            OSError: it can't be read.
         """
-        try:
-            with np.load(path) as file:
-                arrays = dict(file)
-            meta = json.loads(str(arrays["meta"]))
-        except (OSError, KeyError, ValueError) as error:
-            raise ValueError(f"{path}: not a guide file ({error})") from error
-        if meta["format"] > FORMAT:
-            raise ValueError(f"{path}: guide format {meta['format']} is newer than this version's ({FORMAT})")
-
         def part(prefix: str) -> dict[str, np.ndarray]:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
-        guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"])
-        guide.state = states.from_numpy(guide.state, part("state."))
-        guide.count, guide.particles = mi.UInt32(arrays["count"]), meta["particles"]
-        return guide
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+            meta = json.loads(str(arrays["meta"]))
+            if meta["format"] > FORMAT:
+                raise InputError(f"{path}: guide format {meta['format']} is newer than this version's ({FORMAT})")
+            guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"])
+            guide.state = states.from_numpy(guide.state, part("state."))
+            guide.count, guide.particles = mi.UInt32(arrays["count"]), meta["particles"]
+            return guide
+        except (FileNotFoundError, PermissionError, IsADirectoryError, InputError, representations.RepresentationError):
+            raise
+        except (ValueError, TypeError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
+            raise InputError(f"{path}: not a whole guide file (.npz as written by Guide.save)") from error
 
     def __repr__(self) -> str:
         return f"Guide[{self.specification}, {self.records} records, {self.particles} particles]"

@@ -75,20 +75,19 @@ class GuidedBSDF:
     def _one_sample(self, ctx: mi.BSDFContext, choose_bsdf: mi.Bool, bs: mi.BSDFSample3f, weight: mi.Spectrum,
                     sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         """The BSDF's proposal or the guide's, weighted by the mixture."""
-        # The guide's proposal.  It lies on the incident side, so it never crosses an interface: eta = 1.
+        # The guide's proposal; a failed one must carry nothing, though the BSDF may well have a value where it points.
         assert self.guided is not None
-        choose_guide = active & ~choose_bsdf
-        wo = self.si.to_local(self.guided.sample(sample1, sample2, choose_guide))
-        value, bsdf_pdf = self.bsdf.eval_pdf(ctx, self.si, wo, choose_guide)
+        d, found = self.guided.sample(sample1, sample2, active & ~choose_bsdf)
+        wo = self.si.to_local(d)
+        value, bsdf_pdf = self.bsdf.eval_pdf(ctx, self.si, wo, found)
         # The BSDF's proposal; a specular one is no density and is not mixed.
         specular = choose_bsdf & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         value = dr.select(choose_bsdf, weight * bs.pdf, value)
         bsdf_pdf = dr.select(choose_bsdf, bs.pdf, bsdf_pdf)
 
         bs.wo = dr.select(choose_bsdf, bs.wo, wo)
-        bs.eta = dr.select(choose_bsdf, bs.eta, 1)
+        bs.eta = dr.select(choose_bsdf, bs.eta, 1)      # on the record's side of the surface; only roulette reads it
         bs.sampled_type = dr.select(choose_bsdf, bs.sampled_type, mi.UInt32(+mi.BSDFFlags.GlossyReflection))
         bs.pdf = dr.select(specular, bsdf_pdf * self.fraction, self._mixture_pdf(bsdf_pdf, bs.wo))
-        # f is at most bounded by p_bsdf, so dividing by the mixture is safe wherever the value is not zero.
         weight = dr.select(specular, weight / self.fraction, dr.select(bs.pdf > 0, value / bs.pdf, 0))
         return bs, weight & active

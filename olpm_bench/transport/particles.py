@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.settings import InputError
 
 # The weight window [L], relative to the total flux of the emitters, or to 1 for importons.  Its lower end leaves nearly
 # all particles alone: roulette on throughput kills exactly the guided ones, which carry little for a reason.
@@ -53,18 +54,30 @@ class Particles:
 
 
 def emit_photons(scene: mi.Scene, sampler: mi.Sampler) -> ParticleRays:
-    """Rays that leave the emitters, weight = flux (radiance over density)."""
+    """Rays that leave the emitters, weight = flux (radiance over density).
+
+    Raises:
+        InputError: an emitter gives NaN, infinite or negative radiance.
+    """
     ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
     return _evaluated(ray, weight)
 
 
-def emit_importons(scene: mi.Scene, sampler: mi.Sampler) -> ParticleRays:
+def emit_importons(sensor: mi.Sensor, sampler: mi.Sampler) -> ParticleRays:
     """Rays through uniform points of the film, weight = importance 1."""
-    ray, weight = scene.sensors()[0].sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    ray, weight = sensor.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     return _evaluated(ray, weight)
 
 
 def _evaluated(ray: mi.Ray3f, weight: mi.Spectrum) -> ParticleRays:
+    """
+    Raises:
+        InputError: an emitter gives NaN, infinite or negative radiance.
+    """
+    invalid = dr.count(~dr.all(dr.isfinite(weight) & (weight >= 0)))[0]
+    if invalid:
+        raise InputError(f"{invalid} of {dr.width(weight)} emitted particles have a NaN, infinite or negative weight: "
+                         "check the scene's emitters and their textures")
     unit = dr.mean(mi.luminance(weight))
     rays = ParticleRays(mi.Ray3f(ray), mi.Spectrum(weight), unit)
     dr.eval(rays)
@@ -87,13 +100,13 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         mode: `Importance` for photons (which then correct for shading normals), `Radiance` for importons.
 
     Raises:
-        ValueError: more particles than 32 bits can count hits of.
+        InputError: more particles than 32 bits can count hits of.
     """
     n_paths = dr.width(rays.ray.o)
     last = (max_depth if max_depth >= 0 else UNBOUNDED_DEPTH) - 1     # last vertex at which a hit is of use
     rows = 2 * max(last - 1, 1)                                       # of a path and its twins
     if 4 * rows * n_paths >= 2 ** 32:
-        raise ValueError(f"{n_paths} particles of up to {rows} hits in one trace: at most {(2 ** 32 - 1) // (4 * rows)}")
+        raise InputError(f"{n_paths} particles of up to {rows} hits in one trace: at most {(2 ** 32 - 1) // (4 * rows)}")
     photons = mode == mi.TransportMode.Importance
     ctx = mi.BSDFContext(mode)
     position, direction, normal = (dr.empty(mi.Float, 4 * rows * n_paths) for _ in range(3))

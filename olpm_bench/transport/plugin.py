@@ -23,7 +23,7 @@ MITSUBA = {"hide_emitters", "samples_per_pass", "block_size", "timeout", "id"}
 
 
 class GuidedPathPlugin(GuidedPathIntegrator):
-    """Trains on the first render of a scene and keeps the guide for further renders of that scene."""
+    """Trains on the first render of a scene by a camera, and keeps the guide for further ones."""
 
     def __init__(self, props: mi.Properties) -> None:
         given = {name: props[name] for name in props.keys() if name not in MITSUBA}  # noqa: SIM118
@@ -38,13 +38,14 @@ class GuidedPathPlugin(GuidedPathIntegrator):
             self.specification = {"type": representation, **hyper_parameters}
             representations.create(**self.specification)            # a wrong name or parameter is found here
         super().__init__(options.IntegratorSettings(**integrator), props=props)
-        self.trained_on: mi.Scene | None = None
+        self.trained_for: tuple[mi.Scene, mi.Sensor] | None = None
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        if self.specification is not None and self.trained_on is not scene:
+        view = scene, scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        if self.specification is not None and self.trained_for != view:
             self.guide = train(scene, self.specification, self.training_settings, max_depth=self.settings.max_depth,
-                               seed=self.training_seed)
-            self.trained_on = scene
+                               seed=self.training_seed, sensor=view[1])
+            self.trained_for = view
         return super().render(scene, sensor, seed, spp, develop, evaluate)
 
 

@@ -9,12 +9,25 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, TypeVar
 
+from representations import wrong_type
+
 STRICT = {"extra": "forbid"}        # read by pydantic: unknown keys are errors
+
+
+class InputError(ValueError):
+    """Something that the user gave can't be used; the message, one line, names it and says what is allowed."""
 
 
 def _require(ok: bool, name: str, value: object, allowed: str) -> None:
     if not ok:
-        raise ValueError(f"{name} = {value!r}: must be {allowed}")
+        raise InputError(f"{name} = {value!r}: must be {allowed}")
+
+
+def _require_types(settings: Any) -> None:
+    for f in dataclasses.fields(settings):
+        value = getattr(settings, f.name)
+        allowed = wrong_type(value, f.default)
+        _require(allowed is None, f.name, value, allowed or "")
 
 
 @dataclass(frozen=True)
@@ -22,19 +35,21 @@ class IntegratorSettings:
     """The guided path tracer.
 
     max_depth: longest path in segments, as Mitsuba counts: 1 shows emitters only, 2 adds direct light; -1 has no limit.
-    roulette: "throughput" ends paths by their throughput from vertex `rr_depth` on, as Mitsuba's `path` does;
-        "none" never does.
+    roulette: "none" leaves all paths alone: guided ones carry low throughput for a reason; "throughput" ends them by it
+        from vertex `rr_depth` on, as Mitsuba's `path` does.
     fraction: probability of sampling the BSDF rather than the guide where both can be used [T 76-77: 0.5].
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
     max_depth: int = 13
-    roulette: Literal["throughput", "none"] = "throughput"
+    roulette: Literal["none", "throughput"] = "none"
     rr_depth: int = 5
     fraction: float = 0.5
 
     def __post_init__(self) -> None:
+        _require_types(self)
         _require(self.max_depth >= 1 or self.max_depth == -1, "max_depth", self.max_depth, ">= 1, or -1 for no limit")
         _require(self.roulette in ("throughput", "none"), "roulette", self.roulette, "'throughput' or 'none'")
+        _require(self.max_depth >= 1 or self.roulette != "none", "max_depth", self.max_depth, ">= 1 without roulette")
         _require(self.rr_depth >= 1, "rr_depth", self.rr_depth, ">= 1")
         _require(0 < self.fraction <= 1, "fraction", self.fraction, "in (0, 1]")
 
@@ -64,6 +79,7 @@ class TrainingSettings:
     fraction: float = 0.5
 
     def __post_init__(self) -> None:
+        _require_types(self)
         _require(self.schedule in ("interleaved", "single_batch"), "schedule", self.schedule, "'interleaved' or 'single_batch'")
         _require(self.gather in ("binned", "nearest"), "gather", self.gather, "'binned' or 'nearest'")
         for name in ("passes", "importons"):
@@ -88,21 +104,33 @@ def training(preset: str = "fast", **changes: Any) -> TrainingSettings:
     """The settings of a preset, with changes.
 
     Raises:
-        ValueError: unknown preset or key, or a value out of its range.
+        InputError: unknown preset or key, or a value of a wrong type or out of its range.
     """
-    if preset not in PRESETS:
-        raise ValueError(f"unknown preset '{preset}'; known: {', '.join(PRESETS)}")
-    return with_changes(TrainingSettings(**PRESETS[preset]), changes)
+    return with_changes(TrainingSettings(), without_preset({"preset": preset, **changes}))
+
+
+def without_preset(table: dict[str, Any]) -> dict[str, Any]:
+    """Training settings with their `preset`, if they have one, replaced by its values; the table's other keys win.
+
+    Raises:
+        InputError: unknown preset.
+    """
+    if "preset" not in table:
+        return table
+    preset = table["preset"]
+    if not isinstance(preset, str) or preset not in PRESETS:
+        raise InputError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
+    return {**PRESETS[preset], **{k: v for k, v in table.items() if k != "preset"}}
 
 
 def with_changes(settings: Settings, changes: dict[str, Any]) -> Settings:
     """`settings` with some fields changed.
 
     Raises:
-        ValueError: a key that is no field (the message lists them), or a value out of its range.
+        InputError: a key that is no field (the message lists them), or a value of a wrong type or out of its range.
     """
     known = [f.name for f in dataclasses.fields(settings)]  # type: ignore[arg-type]
     for key in changes:
         if key not in known:
-            raise ValueError(f"unknown key '{key}'; known: {', '.join(known)}")
+            raise InputError(f"unknown key '{key}'; known: {', '.join(known)}")
     return dataclasses.replace(settings, **changes)  # type: ignore[type-var]

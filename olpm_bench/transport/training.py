@@ -23,7 +23,7 @@ from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.gather import GATHERS
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
-from olpm_bench.transport.settings import TrainingSettings
+from olpm_bench.transport.settings import InputError, TrainingSettings
 
 
 @dataclass
@@ -41,13 +41,13 @@ class PassStatistics:
 
 def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixture",
           settings: TrainingSettings | None = None, *, max_depth: int = 13, seed: int = 0,
-          on_pass: Callable[[PassStatistics], None] | None = None) -> Guide:
+          sensor: mi.Sensor | None = None, on_pass: Callable[[PassStatistics], None] | None = None) -> Guide:
     """Train a guide for camera paths; see :class:`Training` for the arguments.
 
     Args:
         on_pass: called with the statistics of each pass.
     """
-    training = Training(scene, representation, settings or TrainingSettings(), max_depth, seed)
+    training = Training(scene, representation, settings or TrainingSettings(), max_depth, seed, sensor)
     for statistics in training.run():
         if on_pass is not None:
             on_pass(statistics)
@@ -57,15 +57,15 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
 def check_traceable(scene: mi.Scene) -> None:
     """
     Raises:
-        ValueError: the scene has no emitter or no camera, or a participating medium, which we do not simulate.
+        InputError: the scene has no emitter or no camera, or a participating medium, which we do not simulate.
     """
     if not scene.emitters():
-        raise ValueError("the scene has no emitter")
+        raise InputError("the scene has no emitter")
     if not scene.sensors():
-        raise ValueError("the scene has no camera")
+        raise InputError("the scene has no camera")
     for shape in scene.shapes():
         if shape.is_medium_transition():
-            raise ValueError(f"shape '{shape.id()}' holds a participating medium; only surfaces can be guided")
+            raise InputError(f"shape '{shape.id()}' holds a participating medium; only surfaces can be guided")
 
 
 def surface_bounds(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
@@ -74,7 +74,7 @@ def surface_bounds(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
     Mitsuba 3.9.1 gives meshes that its loader merged from rectangles, and with them the scene, an invalid box.
 
     Raises:
-        ValueError: the scene has no surface.
+        InputError: the scene has no surface.
     """
     bounds = mi.ScalarBoundingBox3f()
     for shape in scene.shapes():
@@ -85,7 +85,7 @@ def surface_bounds(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
             bounds.expand(mi.ScalarPoint3f(*vertices.min(0)))
             bounds.expand(mi.ScalarPoint3f(*vertices.max(0)))
     if not bounds.valid():
-        raise ValueError("the scene has no surface to guide paths from")
+        raise InputError("the scene has no surface to guide paths from")
     return bounds
 
 
@@ -98,15 +98,20 @@ class Training:
         settings: passes, particles, gather, ...
         max_depth: of the paths to be guided.
         seed: everything random follows from it.
+        sensor: the camera, from which importons start; the scene's first by default.
+
+    Raises:
+        InputError: the scene can't be guided; the message says why.
     """
 
     def __init__(self, scene: mi.Scene, representation: str | dict[str, Any], settings: TrainingSettings, max_depth: int,
-                 seed: int = 0) -> None:
+                 seed: int = 0, sensor: mi.Sensor | None = None) -> None:
         check_traceable(scene)
         self.scene, self.settings, self.max_depth, self.seed = scene, settings, max_depth, seed
         specification = {"type": representation} if isinstance(representation, str) else dict(representation)
         self.radiance, self.importance = (Guide(RecordCache(surface_bounds(scene), settings.record_radius), specification)
                                           for _ in range(2))
+        self.sensor = sensor or scene.sensors()[0]
         self.draws = 0                      # samplers made so far: each has its own seed
 
     def run(self) -> Iterator[PassStatistics]:
@@ -119,7 +124,8 @@ class Training:
         """Importons, then photons, each guided by what the other has learnt so far."""
         s = self.settings
         if s.importons:
-            importons = self._trace(emit_importons, s.importons, self.radiance, mi.TransportMode.Radiance, statistics)
+            importons = self._trace(emit_importons, self.sensor, s.importons, self.radiance, mi.TransportMode.Radiance,
+                                    statistics)
             self._learn(self.importance, importons, statistics)
             statistics.importons = s.importons
         return self._photons(s.photons, self.importance, statistics)
@@ -129,20 +135,22 @@ class Training:
         return self._photons(self.settings.photons * self.settings.passes, None, statistics)
 
     def _photons(self, n: int, importance: Guide | None, statistics: PassStatistics) -> PassStatistics:
-        photons = self._trace(emit_photons, n, importance, mi.TransportMode.Importance, statistics)
+        photons = self._trace(emit_photons, self.scene, n, importance, mi.TransportMode.Importance, statistics)
         statistics.kept = self._learn(self.radiance, photons, statistics)
         statistics.photons, statistics.stored = n, len(photons)
         statistics.records = self.radiance.records
         return statistics
 
-    def _trace(self, emit: Callable[[mi.Scene, mi.Sampler], ParticleRays], n: int, guide: Guide | None, mode: mi.TransportMode,
-               statistics: PassStatistics) -> Particles:
+    def _trace(self, emit: Callable[[Any, mi.Sampler], ParticleRays], source: mi.Scene | mi.Sensor, n: int, guide: Guide | None,
+               mode: mi.TransportMode, statistics: PassStatistics) -> Particles:
         with _Seconds(statistics, "trace"):
             sampler = mi.load_dict({"type": "independent"})
             sampler.seed(dr.opaque(mi.UInt32, self._next_seed()), n)
-            return trace(self.scene, emit(self.scene, sampler), sampler, guide, self.settings.fraction, self.max_depth, mode)
+            return trace(self.scene, emit(source, sampler), sampler, guide, self.settings.fraction, self.max_depth, mode)
 
     def _learn(self, guide: Guide, particles: Particles, statistics: PassStatistics) -> int:
+        if len(particles) == 0:             # nothing of this pass has reached a second surface
+            return 0
         with _Seconds(statistics, "grow"):
             p, weight, _, _, n = particles.read(particles.place)
             guide.grow(p, n, weight > 0, self._next_seed())

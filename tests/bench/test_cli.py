@@ -31,8 +31,8 @@ max_depth = 3
 [[method]]
 name = "Path tracing"
 [[method]]
-name = "No roulette"
-integrator = { roulette = "none" }
+name = "Roulette"
+integrator = { roulette = "throughput" }
 """
 
 
@@ -96,7 +96,7 @@ def test_list_shows_scenes_representations_and_experiments(monkeypatch):
 def test_run_prints_the_table_and_writes_the_report(experiment, tmp_path):
     result = call("run", experiment, "--results", tmp_path / "results")
     assert result.exit_code == 0, result.output
-    assert "Path tracing" in result.stdout and "No roulette" in result.stdout
+    assert "Path tracing" in result.stdout and "Roulette" in result.stdout
     folder = tmp_path / "results" / "test"
     for name in ("summary.json", "table.csv", "figure.png", "figure.pdf", "sheet.png", "experiment.toml", "env.json"):
         assert (folder / name).stat().st_size > 0
@@ -195,6 +195,10 @@ def test_a_guide_is_saved_and_used_again(tmp_path):
     assert again.exit_code == 0, again.output
     trained, loaded = (json.loads(r.stdout.splitlines()[-1]) for r in (first, again))
     assert trained["train_seconds"] > 0 and loaded["train_seconds"] == 0 and loaded["records"] == trained["records"] > 0
+    header = read_exr(tmp_path / "b.exr")[1]
+    assert trained["training"]["photons"] == read_exr(tmp_path / "a.exr")[1]["training"]["photons"] == 500
+    for said in (loaded, header):
+        assert said["training"] is None and said["representation"] == {"type": "cosine"}
     np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0]["mean"], read_exr(tmp_path / "b.exr")[0]["mean"])
     other = call("render", "cornell_box", "--method", "jensen", *options[2:], "--out", tmp_path / "c.exr",
                  "--load-guide", guide)
@@ -219,6 +223,20 @@ RENDER = ("render", "cornell_box", "--spp", "1", "--out", "x.exr")
     ((*RENDER, "--method", "cosine", "--set", "training.pases=1"), ["unknown key 'pases'", "passes"]),
     ((*RENDER, "--method", "cosine", "--set", "training.photons=-1"), ["photons = -1", ">= 1"]),
     ((*RENDER, "--method", "cosine", "--set", "representation.k=1"), ["no parameter 'k'"]),
+    ((*RENDER, "--method", "gaussian_mixture", "--set", "representation.components=2.5"),
+     ["components = 2.5", "a whole number"]),
+    ((*RENDER, "--method", "jensen", "--set", "representation.type=hey"), ["representation.type=hey", "--method"]),
+    (("fit", "--representation", "jensen", "--set", "representation.type=hey", "--samples", "s.npz", "--heldout", "h.npz"),
+     ["representation.type=hey", "--representation"]),
+    ((*RENDER, "--method", "jensen", "--load-guide", "g.npz", "--set", "representation.resolution=8"),
+     ["--set representation.resolution", "trained already"]),
+    ((*RENDER, "--method", "jensen", "--load-guide", "g.npz", "--set", "training.passes=8"),
+     ["--set training.passes", "trained already"]),
+    ((*RENDER, "--method", "cosine", "--set", "training.preset=['a']"), ["unknown preset ['a']", "fast, paper2014"]),
+    ((*RENDER, "--method", "unguided", "--set", "scene.light_size=7"), ["light_size = 7.0", "[0.01, 1.9]"]),
+    (("run", "wide.toml", "--dry-run"), ["light_size = 9.0", "[0.01, 1.9]"]),
+    (("run", "broken.toml"), ["broken.py", "cannot be loaded: SyntaxError"]),
+    (("perf", "--scene", "no.xml"), ["no.xml", "no such file"]),
     ((*RENDER, "--method", "unguided", "--set", "scene.gap=1"), ["no parameter 'gap'", "light_size"]),
     ((*RENDER, "--method", "unguided", "--width", "0"), ["width", "0", "greater than or equal to 1"]),
     ((*RENDER, "--method", "unguided", "--threads", "0"), ["--threads 0", ">= 1"]),
@@ -236,6 +254,9 @@ RENDER = ("render", "cornell_box", "--spp", "1", "--out", "x.exr")
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     Path("good.toml").write_text(TOML)
+    Path("wide.toml").write_text(TOML.replace("max_depth = 3", "max_depth = 3\nparameters = { light_size = 9 }"))
+    Path("broken.py").write_text("class Tilted(")
+    Path("broken.toml").write_text(TOML + 'representation = { type = "broken.py:Tilted" }\n')
     Path("bad.toml").write_text(TOML.replace("seeds", "sede"))
     Path("newer/good").mkdir(parents=True)
     Path("newer/good/summary.json").write_text('{"schema_version": 7}')
@@ -267,3 +288,43 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
 
     monkeypatch.setattr(scenes, "names", lambda: 1 / 0)
     assert isinstance(call("list").exception, ZeroDivisionError)
+    monkeypatch.setattr(scenes, "names", lambda: int("no number of the user's"))
+    assert type(call("list").exception) is ValueError
+
+
+@pytest.mark.parametrize("arguments", [
+    (*RENDER, "--method", "unguided"),
+    ("reference", "good.toml"),
+    ("fit", "--representation", "cosine", "--samples", "s.npz", "--heldout", "h.npz")])
+def test_an_error_of_mitsuba_is_one_line_and_exit_code_1(tmp_path, monkeypatch, arguments):
+    """Also with the cause that Dr.Jit keeps to itself, and from `reason` alike in a cell of `run`."""
+    from olpm_bench.bench import fit, run
+
+    def fail(*args, **kwargs):
+        try:
+            raise TypeError("unsupported operand")
+        except TypeError as error:
+            raise RuntimeError("dr.while_loop(): encountered\n  an exception") from error
+
+    monkeypatch.setattr(run, "load_scene", fail)
+    monkeypatch.setattr(fit, "fit", fail)
+    monkeypatch.chdir(tmp_path)
+    Path("good.toml").write_text(TOML)
+    result = call(*arguments)
+    assert result.exit_code == 1
+    assert result.stderr == "olpm-bench: dr.while_loop(): encountered an exception: unsupported operand\n"
+
+
+@pytest.mark.parametrize("script", [False, True], ids=["python -m", "console script"])
+def test_a_libllvm_that_crashes_is_one_line(tmp_path, script):
+    """Both ways to start the command say so before Dr.Jit is loaded; an import as a library raises."""
+    library = tmp_path / "libLLVM-15.so.1"
+    library.touch()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "DRJIT_LIBLLVM_PATH": str(library)}
+    console_script = tmp_path / "olpm-bench"
+    console_script.write_text("import sys\nfrom olpm_bench.cli import main\nsys.exit(main())\n")
+    command = [str(console_script)] if script else ["-m", "olpm_bench.cli"]
+    done = subprocess.run([sys.executable, *command, "list"], capture_output=True, text=True, env=environment)
+    assert "is LLVM 15" in complaint(done) and "unset it" in done.stderr and done.stdout == ""
+    imported = subprocess.run([sys.executable, "-c", "import olpm_bench"], capture_output=True, text=True, env=environment)
+    assert imported.returncode == 1 and "LLVMError: DRJIT_LIBLLVM_PATH=" in imported.stderr.splitlines()[-1]

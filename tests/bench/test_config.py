@@ -25,7 +25,7 @@ name = "Path tracing"
 [[method]]
 name = "Cosine"
 representation = { type = "cosine" }
-integrator = { roulette = "none" }
+integrator = { roulette = "throughput" }
 """
 XML = '<scene version="3.0.0"><default name="resx" value="4"/></scene>'
 
@@ -49,8 +49,8 @@ def test_what_is_written_and_what_is_the_default(tmp_path):
     scene, (unguided, cosine) = experiment.scene[0], experiment.method
     assert experiment.training_of(unguided) is None
     assert experiment.training_of(cosine).passes == 2
-    assert experiment.integrator_of(scene, unguided).roulette == "throughput"
-    assert experiment.integrator_of(scene, cosine).roulette == "none"
+    assert experiment.integrator_of(scene, unguided).roulette == "none"
+    assert experiment.integrator_of(scene, cosine).roulette == "throughput"
     assert experiment.path == tmp_path / "test.toml"
 
 
@@ -79,9 +79,9 @@ def test_presets_apply_before_changes(tmp_path):
     ("width = 16", "widht = 16", ["'widht' in test.toml [[scene]] 1", "width"]),
     ("passes = 2", "pases = 2", ["unknown key 'pases' in test.toml [training]", "preset", "photons"]),
     ("[training]", "[trainig]", ["unknown key 'trainig' in test.toml", "training"]),
-    ('roulette = "none"', 'roulete = "none"', ["'Cosine'", "unknown key 'roulete'", "roulette"]),
-    ('roulette = "none"', 'roulette = "russian"', ["'Cosine'", "roulette", "'russian'", "'throughput'", "'none'"]),
-    ('roulette = "none"', "max_depth = 5", ["max_depth", "[[scene]]"]),
+    ('roulette = "throughput"', 'roulete = "none"', ["'Cosine'", "unknown key 'roulete'", "roulette"]),
+    ('roulette = "throughput"', 'roulette = "russian"', ["'Cosine'", "roulette", "'russian'", "'throughput'", "'none'"]),
+    ('roulette = "throughput"', "max_depth = 5", ["max_depth", "[[scene]]"]),
     ("spp = 8", "spp = 8\nseconds = 3", ["[budget]", "either seconds or spp"]),
     ("spp = 8", "", ["[budget]", "either seconds or spp"]),
     ("spp = 8", "spp = -8", ["[budget]: spp", "-8", "greater than or equal to 1"]),
@@ -110,6 +110,12 @@ def test_presets_apply_before_changes(tmp_path):
     ("width = 16", 'width = 16\nfile = "no.xml"', ["no.xml", "no such file", "--scene"]),
     ("width = 16", 'width = 16\nreference = "no.exr"', ["no.exr", "no such file"]),
     ("width = 16", "width = 16\nmax_depth = 0", ["max_depth = 0", ">= 1, or -1"]),
+    ("passes = 2", "preset = ['fast']", ["[training]", "unknown preset ['fast']", "fast, paper2014"]),
+    ('roulette = "throughput"', 'rr_depth = "two"', ["'Cosine' integrator", "rr_depth = 'two'", "a whole number"]),
+    ('representation = { type = "cosine" }', 'representation = { type = "cosine" }\ntraining = { preset = ["fast"] }',
+     ["'Cosine' training", "unknown preset ['fast']"]),
+    ("passes = 2", "photons = 2.5", ["[training]", "photons", "2.5"]),
+    ("width = 16", "width = 16\nparameters = { light_size = 3 }", ["'cornell_box'", "light_size = 3.0", "[0.01, 1.9]"]),
     ("spp = 8", "spp = ", ["test.toml is not valid TOML", "line 5"]),
 ])
 def test_mistakes_are_named_with_what_is_allowed(tmp_path, old, new, words):
@@ -117,6 +123,37 @@ def test_mistakes_are_named_with_what_is_allowed(tmp_path, old, new, words):
     text = message(tmp_path, MINIMAL.replace(old, new, 1))
     for word in words:
         assert word in text, text
+
+
+def test_what_is_no_table_is_named(tmp_path):
+    text = MINIMAL.replace("[training]\npasses = 2", "").replace('title = "Test"', 'title = "Test"\ntraining = 3')
+    assert message(tmp_path, text) == "test.toml: [training] = 3: must be a table"
+    text = MINIMAL.replace("[[scene]]", "").replace('name = "cornell_box"\nwidth = 16\nheight = 12', "")
+    assert "[[scene]] 1 = 3: must be a table" in message(tmp_path, text.replace("seeds = 2", "seeds = 2\nscene = [3]"))
+
+
+def test_the_hint_names_an_option_only_where_there_is_one(tmp_path):
+    data = {"title": "", "budget": {"spp": 1}, "method": [{"name": "A"}],
+            "scene": [{"name": "a room", "file": "no.xml", "width": 4, "height": 4}]}
+    for scenes, hinted in ((None, False), ({}, True)):
+        with pytest.raises(ConfigError, match="no such file") as error:
+            config.parse(data, "command line", tmp_path, scenes)
+        assert ("--scene 'a room'=PATH" in str(error.value)) == hinted
+
+
+def test_the_key_follows_our_own_code_and_the_reference_does_not(tmp_path, monkeypatch):
+    before = load(tmp_path, MINIMAL)
+    keys = [c.key for c in before.cells()]
+    assert config.own_code() == config.own_code()
+    monkeypatch.setattr(config, "own_code", lambda: "changed")
+    after = load(tmp_path, MINIMAL)
+    assert not set(keys) & {c.key for c in after.cells()}
+    assert before.reference_key(before.scene[0]) == after.reference_key(after.scene[0])
+
+
+def test_the_committed_reference_keeps_its_key():
+    quickstart = config.load(Path(__file__).resolve().parents[2] / "experiments" / "quickstart.toml")
+    assert quickstart.reference_key(quickstart.scene[0]) == "door_ajar-96x54-075c0ded"
 
 
 def test_a_missing_file_and_one_that_is_no_text(tmp_path):
@@ -161,7 +198,7 @@ def test_the_resolved_file_describes_the_same_cells(tmp_path):
 
 
 @pytest.mark.parametrize("old, new", [
-    ("spp = 8", "spp = 9"), ("width = 16", "width = 17"), ("passes = 2", "passes = 3"), ('"none"', '"throughput"'),
+    ("spp = 8", "spp = 9"), ("width = 16", "width = 17"), ("passes = 2", "passes = 3"), ('"throughput"', '"none"'),
     ('type = "cosine"', 'type = "jensen"'), ("width = 16", "width = 16\nparameters = { rotation = 12 }"),
     ("width = 16", "width = 16\nmax_depth = 4"),
 ])
@@ -185,7 +222,7 @@ def test_the_key_follows_the_scenes_files_and_not_their_dates(tmp_path):
     xml.write_text(XML.replace("</scene>", shape + "</scene>"))
     text = MINIMAL.replace("width = 16", 'width = 16\nfile = "room.xml"')
     keys = [load(tmp_path, text).reference_key(load(tmp_path, text).scene[0])]
-    for write in (lambda: xml.touch(), lambda: (tmp_path / "mesh.ply").write_text("ply and more"),
+    for write in (lambda: xml.touch(), lambda: (tmp_path / "mesh.ply").write_text("PLY"),
                   lambda: xml.write_text(XML)):
         write()
         experiment = load(tmp_path, text)

@@ -134,7 +134,9 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
     assert (tmp_path / "x").read_text() == "old" and [f.name for f in tmp_path.iterdir()] == ["x"]
 
 
-def test_a_full_disk_is_an_oserror_and_the_cell_stays_incomplete(tmp_path, monkeypatch):
+@pytest.fixture
+def full_disk(monkeypatch):
+    """From the call on, EXR files cannot be written."""
     import OpenEXR
 
     class Full:
@@ -144,9 +146,13 @@ def test_a_full_disk_is_an_oserror_and_the_cell_stays_incomplete(tmp_path, monke
         def write(self, name):
             raise RuntimeError(f'Failed to write pixel data to image file "{name}". No space left on device.')
 
+    return lambda: monkeypatch.setattr(OpenEXR, "File", Full)
+
+
+def test_a_full_disk_is_an_oserror_and_the_cell_stays_incomplete(tmp_path, monkeypatch, full_disk):
     results = Results(tmp_path)
     write_cell(results, seed=0)
-    monkeypatch.setattr(OpenEXR, "File", Full)
+    full_disk()
     with pytest.raises(OSError) as error:
         write_cell(results, seed=1)
     monkeypatch.undo()
@@ -156,14 +162,26 @@ def test_a_full_disk_is_an_oserror_and_the_cell_stays_incomplete(tmp_path, monke
     assert not list(tmp_path.rglob("*.tmp*"))
 
 
-def test_a_failure_takes_the_place_of_a_cell_and_the_other_way_round(tmp_path):
+def test_a_complete_cell_outlives_the_failure_of_its_successor(tmp_path, monkeypatch, full_disk):
+    """A disk that is full while images or cell.json are written, and a run that fails: all that was there stays."""
     results = Results(tmp_path)
     folder = write_cell(results).folder
+    before = {f.name: f.read_bytes() for f in folder.iterdir()}
+
+    def full(path, value):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    for fill in (full_disk, lambda: monkeypatch.setattr(r, "write_json", full)):
+        fill()
+        with pytest.raises(OSError, match="No space left"):
+            write_cell(results)
+        monkeypatch.undo()
+        assert {f.name: f.read_bytes() for f in folder.iterdir()} == before
     results.write_failure("a scene", "GMM, K = 8", 0, "3 pixels are NaN")
-    assert results.read_cell("a scene", "GMM, K = 8", 0) is None
     assert r.read_json(folder / "failed.json")["reason"] == "3 pixels are NaN"
+    assert {name: (folder / name).read_bytes() for name in before} == before
     write_cell(results)
-    assert not (folder / "failed.json").exists()
+    assert not (folder / "failed.json").exists() and results.verified_cell("a scene", "GMM, K = 8", 0) is not None
 
 
 # ---------------------------------------------------------------- locks
@@ -195,6 +213,8 @@ def test_a_lock_is_held_by_one(tmp_path):
 def test_the_lock_of_the_dead_is_taken_over(tmp_path, stale):
     (tmp_path / "lock").write_text(stale())
     (tmp_path / ".image.exr.host-1.tmp.exr").write_text("half an ima")
+    (tmp_path / ".cell.host-1.tmp").mkdir()
+    (tmp_path / ".cell.host-1.tmp" / "image.exr").write_text("an image")
     with r.locked(tmp_path):
         assert json.loads((tmp_path / "lock").read_text())["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []

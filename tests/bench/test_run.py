@@ -29,8 +29,8 @@ max_depth = 4
 [[method]]
 name = "Path tracing"
 [[method]]
-name = "No roulette"
-integrator = { roulette = "none" }
+name = "Roulette"
+integrator = { roulette = "throughput" }
 """
 
 
@@ -212,17 +212,17 @@ def test_a_failed_cell_is_named_and_the_others_are_run(experiment, root, monkeyp
     monkeypatch.setattr(run, "measure", Counted(fail_at=2, error=error))
     problems = run.run(experiment, root)
     reason = " ".join(str(error).split())
-    assert problems == [f"cornell_box / No roulette / seed 0: {reason}"]
+    assert problems == [f"cornell_box / Roulette / seed 0: {reason}"]
     assert [c is not None for c in cells(experiment, root)] == [True, False, True, True]
-    failed = Results(root / "test").cell_folder("cornell_box", "No roulette", 0) / "failed.json"
+    failed = Results(root / "test").cell_folder("cornell_box", "Roulette", 0) / "failed.json"
     assert json.loads(failed.read_text())["reason"] == reason
 
 
 def test_a_cell_in_other_hands_is_left_alone(experiment, root):
-    with locked(Results(root / "test").cell_folder("cornell_box", "No roulette", 1)):
+    with locked(Results(root / "test").cell_folder("cornell_box", "Roulette", 1)):
         problems = run.run(experiment, root)
     assert len(problems) == 1 and "held by process" in problems[0]
-    assert problems[0].startswith("cornell_box / No roulette / seed 1: ")
+    assert problems[0].startswith("cornell_box / Roulette / seed 1: ")
     assert run.run(experiment, root) == []
 
 

@@ -110,7 +110,7 @@ def test_from_a_results_folder(finished):
 
 
 def test_refuses_to_draw_with_a_missing_cell_and_names_the_command(finished):
-    finished.results.remove_cell("door_ajar", "Quick & dirty", 1)
+    (finished.results.cell_folder("door_ajar", "Quick & dirty", 1) / "cell.json").unlink()
     with pytest.raises(ResultError, match=r"Quick & dirty / seed 1 .* is missing; make it with: olpm-bench run "):
         figures.curves(finished.results, finished.experiment, finished.references)
     assert not (finished.results.folder / "figure.png").exists()

@@ -80,7 +80,7 @@ def test_the_seed_shown_is_the_one_with_the_median_l1():
 
 
 def test_refuses_to_draw_with_a_missing_cell(finished):
-    finished.results.remove_cell("door_ajar", "Path tracing", 2)
+    (finished.results.cell_folder("door_ajar", "Path tracing", 2) / "cell.json").unlink()
     with pytest.raises(ResultError, match=r"door_ajar / Path tracing / seed 2 .* is missing"):
         sheet.sheet(finished.results, finished.experiment, finished.references)
 

@@ -1,6 +1,7 @@
 """Representations by name, by entry point, and from a file."""
 from __future__ import annotations
 
+import importlib.metadata
 import subprocess
 import sys
 from pathlib import Path
@@ -40,7 +41,11 @@ def test_unknown_name() -> None:
     ("jensen", {"resolutoin": 8}, "representation 'jensen' has no parameter 'resolutoin'; known: resolution"),
     ("cosine", {"power": 8}, "representation 'cosine' has no parameter 'power'; known: none"),
     ("jensen", {"resolution": -1}, "representation 'jensen': resolution = -1: must be in 1"),
-    ("jensen", {"resolution": "many"}, "representation 'jensen': "),
+    ("jensen", {"resolution": "many"}, "representation 'jensen': resolution = 'many': must be a whole number"),
+    ("jensen", {"resolution": True}, "resolution = True: must be a whole number"),
+    ("gaussian_mixture", {"components": 2.5}, "representation 'gaussian_mixture': components = 2.5: must be a whole number"),
+    ("gaussian_mixture", {"alpha": "abc"}, "alpha = 'abc': must be a number"),
+    ("gaussian_mixture", {"alpha": False}, "alpha = False: must be a number"),
     ("hey", {"cones": 0}, "representation 'hey': cones = 0: must be in 1"),
 ])
 def test_bad_parameters(name: str, parameters: dict, message: str) -> None:
@@ -62,6 +67,27 @@ def test_from_file_that_lacks_it(tmp_path: Path) -> None:
     file.write_text(OWN)
     with pytest.raises(representations.RepresentationError, match="has no class 'Titled'"):
         representations.create(f"{file}:Titled")
+    with pytest.raises(representations.RepresentationError, match="has no class '__doc__'"):
+        representations.create(f"{file}:__doc__")
+
+
+@pytest.mark.parametrize(("code", "message"), [
+    ("class Tilted(", "SyntaxError: "), ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
+    ("raise RuntimeError('two\\nlines')", "RuntimeError: two lines")])
+def test_from_file_that_cannot_be_run(tmp_path: Path, code: str, message: str) -> None:
+    file = tmp_path / "broken_file.py"
+    file.write_text(code)
+    with pytest.raises(representations.RepresentationError, match=f"broken_file.py cannot be loaded: {message}") as error:
+        representations.create(f"{file}:Tilted")
+    assert "\n" not in str(error.value) and "representation_broken_file" not in sys.modules
+
+
+def test_entry_point_that_cannot_be_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = importlib.metadata.EntryPoint("tilted", "no_such_module:Tilted", representations.ENTRY_POINTS)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group, name=None: [entry])
+    with pytest.raises(representations.RepresentationError,
+                       match="representation 'tilted', entry point no_such_module:Tilted, cannot be loaded: ModuleNotFound"):
+        representations.create("tilted")
 
 
 def test_from_entry_point(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def test_importance_of_a_closed_box():
     """Importons start with 1; vertex k receives a^(k-1)."""
     scene = furnace(ALBEDO)
     sampler = _sampler(2)
-    particles = trace(scene, emit_importons(scene, sampler), sampler, None, 0.5, DEPTH, mi.TransportMode.Radiance)
+    particles = trace(scene, emit_importons(scene.sensors()[0], sampler), sampler, None, 0.5, DEPTH, mi.TransportMode.Radiance)
     assert _flux_by_path(particles).mean() == pytest.approx(sum(ALBEDO ** (k - 1) for k in range(2, DEPTH)), rel=1e-3)
 
 

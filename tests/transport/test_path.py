@@ -57,7 +57,7 @@ def mitsuba_path():
 def test_guided_and_unguided_agree_with_mitsuba(name, mitsuba_path):
     scene = _scene(BSDFS[name]())
     expected = passes(scene, mitsuba_path, seed=1000)
-    assert_same_expectation(passes(scene, olpm_bench.integrator(max_depth=DEPTH)), expected)
+    assert_same_expectation(passes(scene, olpm_bench.integrator(max_depth=DEPTH, roulette="throughput")), expected)
     guide = olpm_bench.train(scene, "gaussian_mixture", max_depth=DEPTH, **TRAINING)
     for roulette in ("none", "throughput"):
         guided = olpm_bench.integrator(guide, max_depth=DEPTH, roulette=roulette)
@@ -101,7 +101,7 @@ def test_furnace(representation, garbage):
     guide = guide.radiance
     if garbage:
         _teach_garbage(guide)
-    image = passes(scene, olpm_bench.integrator(guide, max_depth=40, rr_depth=8), n=16, spp=256)
+    image = passes(scene, olpm_bench.integrator(guide, max_depth=40, roulette="throughput", rr_depth=8), n=16, spp=256)
     assert np.isfinite(image).all() and (image >= 0).all()
     mean, error = image.mean(), image.mean((1, 2, 3)).std(ddof=1) / 4
     assert abs(mean - 1 / (1 - albedo)) < 4 * error + 1e-4

@@ -105,7 +105,7 @@ def test_guides_are_saved_and_loaded(scene, tmp_path):
     a, b = (mi.render(scene, integrator=olpm_bench.integrator(g, max_depth=DEPTH), spp=8, seed=1).numpy() for g in (guide, again))
     np.testing.assert_array_equal(a, b)
     (tmp_path / "broken.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"broken.npz: not a guide file"):
+    with pytest.raises(ValueError, match=r"broken.npz: not a whole guide file"):
         Guide.load(tmp_path / "broken.npz")
 
 
@@ -146,3 +146,12 @@ def test_scenes_that_cannot_be_traced_are_refused(change, message):
     change(content)
     with pytest.raises(ValueError, match=message):
         train(mi.load_dict(content), "jensen", SMALL, max_depth=DEPTH)
+
+
+def test_particles_that_never_land_leave_the_bsdf():
+    """Black walls: nothing is kept, nothing is learnt, and the image is direct light."""
+    scene = mi.load_dict(box(grey(0.0), lamp=lamp()))
+    for gather in ("binned", "nearest"):
+        guide = train(scene, "gaussian_mixture", settings.with_changes(SMALL, {"gather": gather}), max_depth=DEPTH)
+        assert guide.records == 0 and guide.particles == 0
+        assert np.isfinite(mi.render(scene, integrator=olpm_bench.integrator(guide, max_depth=DEPTH), spp=4).numpy()).all()

@@ -1,0 +1,41 @@
+"""`olpm-bench perf`: what it prints, on tiny work."""
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from typer.testing import CliRunner
+
+import representations
+from olpm_bench.bench import perf
+from olpm_bench.cli import app
+
+
+def test_figures_of_the_issue(monkeypatch):
+    monkeypatch.setattr(perf, "REPEATS", 1)
+    monkeypatch.setattr(perf, "RECORDS", 8)
+    monkeypatch.setattr(perf, "EACH", 16)
+    monkeypatch.setattr(perf, "MAX_DEPTH", 4)
+    monkeypatch.setattr(perf, "PARTICLES", {"photons": 2000, "importons": 500})
+    monkeypatch.setattr(representations, "names", lambda: ["cosine", "gaussian_mixture"])
+    figures = json.loads(json.dumps(perf.measure("cornell_box", 16, 12, spp=2, passes=3), allow_nan=False))
+    assert figures["scene"] == "cornell_box" and (figures["width"], figures["height"]) == (16, 12)
+    assert isinstance(figures["recompiles_after_warmup"], int)
+    assert {"trace", "gather", "update"} <= figures["pass_seconds"].keys() == figures["pass_seconds_nearest"].keys()
+    assert figures["guided_vertex_ns"].keys() == {"cosine", "gaussian_mixture"} and len(figures["rss_mb_by_pass"]) == 3
+    for value in (figures["em_ns_per_particle"], figures["unguided_vertex_ns"], *figures["guided_vertex_ns"].values(),
+                  figures["peak_rss_mb"]):
+        assert value > 0 and math.isfinite(value)
+
+
+@pytest.mark.parametrize("arguments, expected", [
+    ((), ("door_ajar", 160, 90, 20)),
+    (("--scene", "a/room.xml", "--width", "32", "--height", "18", "--passes", "3"), ("a/room.xml", 32, 18, 3))])
+def test_the_command_passes_its_options_on(monkeypatch, arguments, expected):
+    def measure(scene, width, height, passes):
+        return {"given": [scene, width, height, passes]}
+
+    monkeypatch.setattr(perf, "measure", measure)
+    result = CliRunner().invoke(app, ["perf", *arguments])
+    assert json.loads(result.stdout)["given"] == list(expected)

@@ -1,0 +1,38 @@
+"""Settings: presets, changes, and what is refused with which words."""
+from __future__ import annotations
+
+import pytest
+
+from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, training, with_changes
+
+
+def test_changes_win_over_the_preset():
+    settings = training("paper2014", photons=7)
+    assert settings.gather == "nearest" and settings.photons == 7
+    assert training() == TrainingSettings()
+
+
+@pytest.mark.parametrize("preset", ["slow", ["fast"], None])
+def test_unknown_presets(preset):
+    with pytest.raises(InputError, match=r"unknown preset .*; known: fast, paper2014"):
+        training(preset)
+
+
+@pytest.mark.parametrize("changes, message", [
+    ({"pases": 3}, "unknown key 'pases'; known: schedule, passes"),
+    ({"passes": -1}, "passes = -1: must be >= 0"),
+    ({"passes": 2.5}, r"passes = 2\.5: must be a whole number"),
+    ({"passes": True}, "passes = True: must be a whole number"),
+    ({"photons": "many"}, "photons = 'many': must be a whole number"),
+    ({"fraction": "half"}, "fraction = 'half': must be a number"),
+    ({"fraction": float("nan")}, r"fraction = nan: must be in \(0, 1\]"),
+    ({"gather": ["binned"]}, r"gather = \['binned'\]: must be a string"),
+    ({"gather": "near"}, "gather = 'near': must be 'binned' or 'nearest'"),
+])
+def test_wrong_values(changes, message):
+    with pytest.raises(InputError, match=message):
+        with_changes(TrainingSettings(), changes)
+
+
+def test_a_whole_number_is_a_number():
+    assert with_changes(IntegratorSettings(), {"fraction": 1}).fraction == 1
