@@ -93,7 +93,7 @@ class TrainingSettings:
 PRESETS: dict[str, dict[str, Any]] = {
     # The fast gather and records that fill at few particles: what pays at equal time on two cores.
     "fast": {},
-    # The talk's own choices [T, L].
+    # The talk's own particles and gather [T, L]; its records also shrink near sources, ours do not.
     "paper2014": {"gather": "nearest", "record_radius": 0.01, "photons": 300_000, "importons": 300_000},
 }
 
