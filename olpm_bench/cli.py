@@ -82,6 +82,10 @@ def _load(path: Path, replacements: list[str] | None = None) -> Any:
         if not equals or not name or not file:
             raise config.ConfigError(f"--scene {text}: must be NAME=PATH")
         scenes[name] = Path(file)
+    if path.is_file() and ".py:" in path.read_text(encoding="utf-8", errors="replace"):
+        from olpm_bench.bench import environment
+
+        environment.select_variant()            # other people's file may name Mitsuba's types when it is imported
     return config.load(path, scenes)
 
 

@@ -102,7 +102,9 @@ def offsets(key: mi.UInt32, n_keys: int) -> mi.UInt32:
 
 
 class DirectionalPdf(Protocol[State]):
-    """Four verbs.  `check` them with a chi-square test: `sample` and `pdf` must be the same distribution."""
+    """Four verbs.  `tests/representations/test_conformance.py` checks that `sample` and `pdf` are one distribution, and more:
+    ``pytest tests/representations/test_conformance.py --representation path/to/file.py:ClassName``.
+    """
 
     def init(self, n_records: int, seed: int = 0) -> State:
         """A state that already is a valid density for every record, before any particle."""
@@ -113,7 +115,8 @@ class DirectionalPdf(Protocol[State]):
 
         First fit and on-line update are this one verb.  Pure: the argument is left alone and the result depends
         on nothing but the arguments.  A record without particles in the batch keeps its density.  Zero weights
-        teach nothing.  The batch is never seen again.
+        teach nothing, and a batch may be empty.  The batch is never seen again.  Sums over particles must be taken in
+        their order (as `jensen` does, a lane a record), not by `scatter_add`, whose rounding depends on threads.
         """
         ...
 

@@ -9,6 +9,10 @@ import mitsuba as mi
 import pytest
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--representation", help="check path/to/file.py:ClassName in test_conformance.py, instead of the registered")
+
+
 @pytest.fixture(autouse=True, scope="session")
 def variant() -> str:
     """Every test runs in the variant that needs no GPU."""

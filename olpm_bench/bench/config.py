@@ -60,7 +60,7 @@ class Budget(Table):
     @model_validator(mode="after")
     def _one(self) -> Budget:
         if (self.seconds is None) == (self.spp is None):
-            raise ValueError("give either seconds or spp, and not both")
+            raise ValueError("give one of seconds and spp")
         return self
 
 

@@ -29,7 +29,7 @@ def settings(assignments: list[str], tables: tuple[str, ...] = TABLES) -> dict[s
         left, equals, value = text.partition("=")
         table, dot, key = left.strip().partition(".")
         if not equals or not dot or not key:
-            raise ConfigError(f"--set {text}: must be {tables[0]}.key=value")
+            raise ConfigError(f"--set {text}: must be TABLE.KEY=VALUE with a table of {', '.join(tables)}")
         if table not in found:
             raise ConfigError(f"--set {text}: unknown table '{table}'; known: {', '.join(tables)}")
         if (table, key) == ("representation", "type"):
@@ -58,7 +58,7 @@ def cell(scene: str, method: str, assignments: list[str], *, seconds: float | No
         ConfigError: any of them is wrong.
     """
     if (seconds is None) == (spp is None):
-        raise ConfigError("give either --seconds or --spp, and not both")
+        raise ConfigError("give one of --seconds and --spp")
     tables = settings(assignments)
     for table in ("representation", "training"):
         if load_guide is not None and tables[table]:

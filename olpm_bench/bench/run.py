@@ -46,6 +46,8 @@ SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
 MAX_LANES = 2**24           # paths in flight: about 2 GB
 WARM_UP_PATHS = 20_000      # photons and importons of the training that compiles the kernels
 
+TRAINED = 0.5               # share of trained records below which a guide is reported: most paths are then unguided
+
 # 32-bit seeds of rendering passes: cells from 0, warm-up from 2^30, reference halves from 2^31 and 3 * 2^30.
 PASSES_PER_SEED = 2**15
 WARM_UP_SEED = 2**30
@@ -238,6 +240,7 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
         "render_seconds": clock["render"].charged, "compile_seconds": warm.compile_seconds + kernels.seconds,
         "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
         "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
+        "trained": guide.trained if guide is not None else None,
         **counts, "bytes_per_record": guide.bytes_per_record if guide is not None else 0, "invalid_pixels": 0,
         "mean": float(brightness.mean[0, 0, 0]), "mean_stderr": stderr, "pass_spp": spp, "passes": passes,
     }
@@ -335,6 +338,9 @@ def run(experiment: Experiment, root: Path) -> list[str]:
             if cell is not None:
                 info = cell.info
                 flag = f", waited {info['wait_fraction']:.0%} for busy cores" if info["wait_fraction"] > WAITED else ""
+                if info["trained"] is not None and info["trained"] < TRAINED:
+                    flag += (f"; only {info['trained']:.0%} of the records have seen particles enough to guide: "
+                             "more photons or passes, or a larger record_radius")
                 bar.say(f"[{index + 1}/{len(todo)}] {spec}: {info['spp']} spp in {info['charged_seconds']:.1f} s, "
                         f"{info['train_seconds']:.1f} s of it training{flag}")
     return problems

@@ -246,7 +246,7 @@ def _draw_floor(axes: Axes, panel: Panel) -> None:
         _note(axes, "noise of the reference", (1, panel.floor), (-2, -2), ha="right", va="top")
     elif panel.floor > 0:
         text = f"noise of the reference: {tick_label(float(f'{panel.floor:.2g}'))} \N{DOWNWARDS ARROW}"
-        _note(axes, text, (1, low), (-2, 2), ha="right", va="bottom")
+        _note(axes, text, (0, low), (4, 2), ha="left", va="bottom")      # training's triangles are further right
 
 
 def _note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **alignment: Any) -> None:

@@ -59,6 +59,11 @@ class Guide:
         return len(self.cache)
 
     @property
+    def trained(self) -> float:
+        """Share of the records that have seen `MIN_PARTICLES` and guide paths."""
+        return float(np.mean(self.count.numpy() >= MIN_PARTICLES)) if self.records else 0.0
+
+    @property
     def bytes_per_record(self) -> float:
         """Learned state only, in bytes."""
         return states.bytes_of(self.state) / max(self.records, 1)
@@ -82,6 +87,8 @@ class Guide:
 
     def learn(self, batch: ParticleBatch, seed: int) -> None:
         """One on-line update with the particles of one pass."""
+        if len(batch) == 0:
+            return
         self.state = self.representation.update(self.state, batch, seed)
         self.count = self.count + batch.count()
         self.particles += len(batch)
@@ -125,4 +132,4 @@ class Guide:
             raise InputError(f"{path}: not a whole guide file (.npz as written by Guide.save)") from error
 
     def __repr__(self) -> str:
-        return f"Guide[{self.specification}, {self.records} records, {self.particles} particles]"
+        return f"Guide[{self.specification}, {self.records} records ({self.trained:.0%} trained), {self.particles} particles]"

@@ -15,7 +15,13 @@ TESTS = [conformance.density_is_valid, conformance.sample_reports_pdf, conforman
          conformance.nothing_new_changes_nothing, conformance.records_can_be_appended, conformance.inactive_lanes_are_harmless]
 
 
-@pytest.fixture(params=representations.names(), scope="module")
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "representation" in metafunc.fixturenames:
+        given = metafunc.config.getoption("--representation")
+        metafunc.parametrize("representation", [given] if given else representations.names(), indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
 def representation(request: pytest.FixtureRequest) -> Any:
     return representations.create(request.param)
 
