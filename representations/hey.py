@@ -8,6 +8,7 @@ learning in constant memory.
 """
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import drjit as dr
@@ -16,6 +17,7 @@ import mitsuba as mi
 from representations import discrete
 from representations.cosine import cosine_pdf, sample_cosine
 from representations.interface import ParticleBatch
+from representations.state import join
 
 GRID = 64                   # cells along each side of the square around the projected hemisphere
 FOOTPRINT = 240             # radius of a cone, in units of solid angle of a cell / particles around the cell
@@ -114,7 +116,7 @@ class HeyCones:
         """
         n = len(batch)
         useful = (batch.weight > 0) & (batch.wo.z > 0)
-        rank = dr.prefix_sum(dr.concat([mi.UInt32(useful), mi.UInt32(0)]))          # [n + 1] useful ones before
+        rank = dr.prefix_sum(join(mi.UInt32(useful), dr.zeros(mi.UInt32, 1)))       # [n + 1] useful ones before
         before = dr.gather(mi.UInt32, rank, batch.offset)                           # [n_records + 1]
         record = dr.arange(mi.UInt32, batch.n_records)
         start = seen - dr.gather(mi.UInt32, before, record)                         # wraps around, and back in `t`
@@ -156,6 +158,6 @@ class HeyCones:
             chord2 = 2 * radius * radius / (1 + dr.safe_sqrt(1 - radius * radius))      # sin -> 2 (1 - cos)
             chords.append(dr.select(here, chord2, 0))
             dr.eval(chords[-1])
-        chord2 = dr.concat(chords) if chords else mi.Float()
-        dr.eval(chord2)         # `concat` scatters, and what is built on a pending scatter can't be scattered again
+        chord2 = functools.reduce(join, chords, mi.Float())
+        dr.eval(chord2)         # `join` scatters, and what is built on a pending scatter can't be scattered again
         return chord2

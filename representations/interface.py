@@ -82,7 +82,7 @@ def group(key: mi.UInt32, n_keys: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]
     order = dr.argsort(key)
     key = dr.gather(mi.UInt32, key, order)
     offset = offsets(key, n_keys)
-    inside = dr.arange(mi.UInt32, int(offset[n_keys]))      # the keys left out are at the end
+    inside = dr.arange(mi.UInt32, int(dr.max(offset)[0]))   # the keys left out are at the end
     return dr.gather(mi.UInt32, order, inside), dr.gather(mi.UInt32, key, inside), offset
 
 

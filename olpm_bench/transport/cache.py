@@ -124,8 +124,8 @@ class RecordCache:
         if len(cells) < LEAST:
             return 0
         representative = dr.gather(mi.UInt32, first, cells)
-        points = np.concatenate([dr.gather(mi.Point3f, p, representative).numpy(),
-                                 dr.gather(mi.Normal3f, n, representative).numpy()]).T.astype(np.float32)
+        # By component: to turn a whole vector into NumPy compiles its length into a kernel.
+        points = np.stack([dr.gather(mi.Float, x, representative).numpy() for x in (*p, *n)], axis=1)
         uncovered = self._best(points)[1] > self.radius
         added = points[_independent(points, uncovered, self.radius)]
         known = np.ones(len(points), bool)
@@ -155,10 +155,10 @@ class RecordCache:
         """Enter into the `stale` ones of the occupied cells the best record for the point that represents each."""
         record, distance = self._best(self.cell_points[stale])
         entry = np.where(distance <= self.radius, record, MISSING).astype(np.uint32)
-        dr.scatter(self.table, mi.UInt32(entry), mi.UInt32(self.cells[stale]))
+        dr.scatter(self.table, _copied(mi.UInt32, entry), _copied(mi.UInt32, self.cells[stale]))
         rows = np.zeros((len(self), 8), np.float32)
         rows[:, :3], rows[:, 3], rows[:, 4:7] = self.points[:, :3], (REACH * self.radius) ** 2, self.points[:, 3:]
-        self.rows = mi.Float(rows.ravel())
+        self.rows = _copied(mi.Float, rows.ravel())
         dr.eval(self.table, self.rows)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
@@ -175,6 +175,13 @@ class RecordCache:
         if len(cache):
             cache._tabulate(np.ones(len(cache.cells), bool))
         return cache
+
+
+def _copied(dtype: Any, array: np.ndarray) -> Any:
+    """In Dr.Jit's own memory: NumPy's is aligned now this way, now that, and each way compiles other kernels."""
+    copy = dr.gather(dtype, dtype(array), dr.arange(mi.UInt32, len(array)))
+    dr.eval(copy)
+    return copy
 
 
 def _near(points: np.ndarray, others: np.ndarray, radius: float) -> np.ndarray:

@@ -112,7 +112,8 @@ class Training:
         self.radiance, self.importance = (Guide(RecordCache(surface_bounds(scene), settings.record_radius), specification)
                                           for _ in range(2))
         self.sensor = sensor or scene.sensors()[0]
-        self.draws = 0                      # samplers made so far: each has its own seed
+        self.sampler = mi.load_dict({"type": "independent"})
+        self.draws = 0                      # seeds used so far
 
     def run(self) -> Iterator[PassStatistics]:
         """Train as the settings say, one pass at each step."""
@@ -144,9 +145,9 @@ class Training:
     def _trace(self, emit: Callable[[Any, mi.Sampler], ParticleRays], source: mi.Scene | mi.Sensor, n: int, guide: Guide | None,
                mode: mi.TransportMode, statistics: PassStatistics) -> Particles:
         with _Seconds(statistics, "trace"):
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(dr.opaque(mi.UInt32, self._next_seed()), n)
-            return trace(self.scene, emit(source, sampler), sampler, guide, self.settings.fraction, self.max_depth, mode)
+            self.sampler.seed(dr.opaque(mi.UInt32, self._next_seed()), n)
+            rays = emit(source, self.sampler)
+            return trace(self.scene, rays, self.sampler, guide, self.settings.fraction, self.max_depth, mode)
 
     def _learn(self, guide: Guide, particles: Particles, statistics: PassStatistics) -> int:
         if len(particles) == 0:             # nothing of this pass has reached a second surface
