@@ -53,13 +53,14 @@ def register() -> None:
 
 
 def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixture", *, max_depth: int = 13, seed: int = 0,
-          preset: str = "fast", **settings: Any) -> Guide:
+          preset: str = "best", integrator: dict[str, Any] | None = None, **settings: Any) -> Guide:
     """Train a guide on a scene.
 
     Args:
         representation: a registered name, or ``{"type": name, ...hyper-parameters}``.
         max_depth: of the camera paths to be guided [segments].
         preset, settings: of `olpm_bench.transport.settings.TrainingSettings`: passes, photons, importons, gather, ...
+        integrator: of `IntegratorSettings`, for the passes of camera paths: roulette, fraction, ...
 
     Returns:
         A guide, which can be saved, loaded (`olpm_bench.transport.guide.Guide.load`) and handed to :func:`integrator`.
@@ -67,14 +68,15 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
     register()
     from olpm_bench.transport import settings as options
     from olpm_bench.transport import training
-    return training.train(scene, representation, options.training(preset, **settings), max_depth=max_depth, seed=seed)
+    return training.train(scene, representation, options.training(preset, **settings),
+                          options.integrator(preset, max_depth=max_depth, **integrator or {}), seed=seed)
 
 
 def integrator(guide: Guide | None = None, **settings: Any) -> GuidedPathIntegrator:
     """A path tracer with a guide, or an unguided one.
 
     Args:
-        settings: of `olpm_bench.transport.settings.IntegratorSettings`: max_depth, roulette, rr_depth, fraction.
+        settings: of `olpm_bench.transport.settings.IntegratorSettings`: max_depth, roulette, rr_depth, window, fraction.
     """
     register()
     from olpm_bench.transport.path import GuidedPathIntegrator

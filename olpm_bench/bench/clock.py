@@ -100,6 +100,12 @@ class Clock:
         lap.charged *= 1 - lap.compile / wall       # the compiler waited for cores like everybody else
         self.laps[label] = self[label] + lap
 
+    def move(self, share: float, source: str, target: str) -> None:
+        """Book a share of a label's totals under another one."""
+        part = Lap(**{f.name: share * getattr(self[source], f.name) for f in fields(Lap)})
+        rest = Lap(**{f.name: getattr(self[source], f.name) - getattr(part, f.name) for f in fields(Lap)})
+        self.laps[source], self.laps[target] = rest, self[target] + part
+
     def __getitem__(self, label: str) -> Lap:
         return self.laps.get(label, Lap())
 

@@ -35,7 +35,7 @@ import representations
 from olpm_bench import scenes as embedded
 from olpm_bench import transport
 from olpm_bench.bench.results import SCHEMA_VERSION, slug
-from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes, without_preset
+from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, preset_of, with_changes
 
 MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see run.pass_seed
 
@@ -222,10 +222,10 @@ class Experiment(Table):
             raise ValueError(f"must be different numbers from 0 to {MAX_SEED}")
         return value
 
-    @field_validator("training", mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _preset(cls, value: Any) -> Any:
-        return without_preset(value) if isinstance(value, dict) else value
+    def _presets(cls, data: Any) -> Any:
+        return _without_presets(data) if isinstance(data, dict) else data
 
     @model_validator(mode="after")
     def _distinct(self) -> Experiment:
@@ -254,12 +254,11 @@ class Experiment(Table):
             raise InputError(f"method {method.name!r} integrator: {error}") from None
 
     def training_of(self, method: Method) -> TrainingSettings | None:
-        """The method's training; None if it has no representation.  Its own `preset` starts from that preset."""
+        """The method's training; None if it has no representation."""
         if method.representation is None:
             return None
-        start = TrainingSettings() if "preset" in method.training else self.training
         try:
-            return with_changes(start, without_preset(method.training))
+            return with_changes(self.training, method.training)
         except InputError as error:
             raise InputError(f"method {method.name!r} training: {error}") from None
 
@@ -312,6 +311,48 @@ class Experiment(Table):
     def toml(self, relative_to: Path | None = None) -> str:
         """`resolved` as TOML; reading it back gives the same cells."""
         return "\n".join(_toml_lines(self.resolved(relative_to))) + "\n"
+
+
+def _without_presets(data: dict[str, Any]) -> dict[str, Any]:
+    """The experiment with every `preset` replaced by its values.
+
+    A preset's training settings give way to those beside it, and its integrator settings to those of the table that it
+    belongs to: `[training] preset` to `[integrator]`, a method's own to the method's `integrator`.  Methods without a
+    representation have no preset.
+
+    Raises:
+        InputError: unknown preset.
+    """
+    def table(value: Any) -> dict[str, Any]:
+        return value if isinstance(value, dict) else {}
+
+    training = data.get("training", {})
+    preset = _preset_of(table(training).get("preset", "best"), "[training]")
+    common = {k: v for k, v in preset["integrator"].items() if k not in table(data.get("integrator"))}
+    if isinstance(training, dict):
+        training = preset["training"] | {k: v for k, v in training.items() if k != "preset"}
+    methods = data.get("method")
+    if isinstance(methods, list):
+        methods = [_without_preset(method, common) if table(method).get("representation") is not None else method
+                   for method in methods]
+    return data | {"training": training} | ({"method": methods} if "method" in data else {})
+
+
+def _without_preset(method: dict[str, Any], common: dict[str, Any]) -> dict[str, Any]:
+    """A method with its own preset replaced by its values, or else with the integrator settings `common` to all."""
+    training, integrator = method.get("training", {}), method.get("integrator", {})
+    if isinstance(training, dict) and "preset" in training:
+        preset = _preset_of(training["preset"], f"method {method.get('name')!r} training")
+        start = dataclasses.asdict(TrainingSettings()) | preset["training"]
+        training, common = start | {k: v for k, v in training.items() if k != "preset"}, preset["integrator"]
+    return method | {"training": training, "integrator": common | integrator if isinstance(integrator, dict) else integrator}
+
+
+def _preset_of(name: Any, where: str) -> dict[str, dict[str, Any]]:
+    try:
+        return preset_of(name)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def reference_key(scene: Scene, max_depth: int) -> str:

@@ -46,7 +46,8 @@ def measure(scene: str = "door_ajar", width: int = 160, height: int = 90, spp: i
     guides: dict[str, Guide | None] = {"unguided": None, "gaussian_mixture": guide}
     for name in representations.names():
         if name not in guides:
-            training = Training(loaded, name, options.training(passes=3, **PARTICLES), MAX_DEPTH)
+            training = Training(loaded, name, options.training(passes=3, camera_passes=0, **PARTICLES),
+                                options.integrator(max_depth=MAX_DEPTH))
             for _ in training.run():
                 pass
             guides[name] = training.radiance
@@ -80,7 +81,8 @@ def em_ns_per_particle() -> float:
 
 def training_passes(scene: mi.Scene, passes: int, gather: str) -> tuple[Guide, dict[str, float], int, list[float]]:
     """Train a mixture: the guide, median wall seconds of a pass by part, kernels compiled after pass 2, memory by pass."""
-    training = Training(scene, "gaussian_mixture", options.training(passes=passes, gather=gather, **PARTICLES), MAX_DEPTH)
+    training = Training(scene, "gaussian_mixture", options.training(passes=passes, camera_passes=0, gather=gather, **PARTICLES),
+                        options.integrator(max_depth=MAX_DEPTH))
     seconds, rss, warm_up = [], [], 0
     with Kernels.watched() as kernels:
         for statistics in training.run():

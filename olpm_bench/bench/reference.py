@@ -116,7 +116,7 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
                     with clock.lap("render"):
                         rendered = run.render_pass(scene, integrator, seed + half.passes, spp)
                     image = run.to_numpy(rendered)
-                    run.check_pixels(image, seed + half.passes)
+                    run.check_pixels(image, f"the pass with seed {seed + half.passes}")
                     half.add(image, spp)
                 halves.seconds = before + clock.charged
                 bar.at(done + clock.charged, f"{spec.scene.name}: {halves}")

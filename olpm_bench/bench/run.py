@@ -38,8 +38,7 @@ from olpm_bench.bench.results import (
 )
 from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
-from olpm_bench.transport.settings import TrainingSettings
-from olpm_bench.transport.training import PassStatistics, train
+from olpm_bench.transport.training import PassStatistics, Training, train
 
 PASSES = 40                 # rendering passes in a budget, at least: so it is met within 1/40
 SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
@@ -120,8 +119,10 @@ def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> Warm
         if guide is None and spec.training is not None:
             small = dataclasses.replace(spec.training, passes=min(spec.training.passes, 4),
                                         photons=min(spec.training.photons, WARM_UP_PATHS),
-                                        importons=min(spec.training.importons, WARM_UP_PATHS))
-            guide = _train(spec, scene, small, WARM_UP_SEED)
+                                        importons=min(spec.training.importons, WARM_UP_PATHS),
+                                        camera_passes=min(spec.training.camera_passes, 4),
+                                        camera_paths=min(spec.training.camera_paths, WARM_UP_PATHS))
+            guide = train(scene, spec.method.representation or {}, small, spec.integrator, seed=WARM_UP_SEED)
         integrator = make_integrator(spec, guide)
         for spp in (1, 2):      # dividing by 1 is a kernel of its own
             render_pass(scene, integrator, WARM_UP_SEED, spp)
@@ -133,15 +134,6 @@ def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> Warm
             if clock.charged > SHORTEST_PASS / 4 or 4 * spp > largest_pass(spec):
                 return WarmUp(kernels.seconds, max(clock.charged, 1e-6) / spp)
             spp *= 4
-
-
-def _train(spec: CellSpec, scene: mi.Scene, settings: TrainingSettings, seed: int,
-           on_pass: Callable[[PassStatistics], None] | None = None) -> Guide:
-    assert spec.method.representation is not None
-    guide = train(scene, spec.method.representation, settings, max_depth=spec.integrator.max_depth, seed=seed,
-                  on_pass=on_pass)
-    dr.sync_thread()
-    return guide
 
 
 def largest_pass(spec: CellSpec) -> int:
@@ -179,74 +171,132 @@ class Measurement:
     guide: Guide | None = field(repr=False, default=None)
 
 
+class _Cell:
+    """A cell in the making: its clock, the image so far, and what it writes down on the way."""
+
+    def __init__(self, spec: CellSpec, kernels: Kernels) -> None:
+        self.spec, self.kernels = spec, kernels
+        self.clock = Clock(count_wait=environment.uses_llvm())
+        self.image = Accumulator.empty(spec.scene.height, spec.scene.width)
+        self.brightness = Accumulator.empty(1, 1)
+        self.training: list[dict[str, Any]] = []
+        self.trace: list[dict[str, Any]] = []
+        self.checkpoints: list[np.ndarray] = []
+        self.targets: list[float] | None = None
+
+    @property
+    def spent(self) -> float:
+        """Share of the budget; the rule to stop does not look at the image."""
+        budget = self.spec.budget
+        return self.image.spp / budget.spp if budget.spp is not None else self.clock.charged / (budget.seconds or 1)
+
+    def train(self, training: Training) -> Iterator[PassStatistics]:
+        """Training passes, until all are done or their share of a budget in seconds is spent."""
+        settings, seconds = training.settings, self.spec.budget.seconds
+        end = settings.share * seconds if seconds is not None else math.inf
+        passes = training.run()
+        while self.clock.charged < end:
+            late = self.clock.charged >= end / 2 if seconds is not None else 2 * len(self.training) >= training.passes
+            if (statistics := self._learn(lambda: next(passes, None), late and settings.blend)) is None:
+                break
+            yield statistics
+
+    def render_and_learn(self, training: Training) -> None:
+        """A rendering pass from which the guide goes on learning."""
+        self._learn(training.camera_pass, True)
+
+    def render(self, scene: mi.Scene, integrator: mi.Integrator, spp: int) -> None:
+        """A rendering pass of at most `spp` samples a pixel."""
+        left = self.spec.budget.spp - self.image.spp if self.spec.budget.spp is not None else spp
+        spp, seed = power_of_two(min(spp, left)), pass_seed(self.spec.seed, self.image.passes)
+        with self.clock.lap("render", self.kernels.compiled):
+            rendered = render_pass(scene, integrator, seed, spp)
+        self._add(rendered, spp, f"the pass with seed {seed}")
+
+    def _learn(self, learn: Callable[[], PassStatistics | None], enters: bool) -> PassStatistics | None:
+        """A training pass.  The time of tracing an image that enters the result is booked as rendering."""
+        before = self.clock["train"].charged
+        with self.clock.lap("train", self.kernels.compiled):
+            statistics = learn()
+            dr.sync_thread()
+        if statistics is None:
+            return None
+        self.training.append(statistics.as_dict())
+        room = self.spec.budget.spp is None or self.image.spp + statistics.spp <= self.spec.budget.spp
+        if statistics.image is not None and enters and room:
+            taken = self.clock["train"].charged
+            self.clock.move((taken - before) / taken * statistics.share("trace"), "train", "render")
+            self._add(statistics.image, statistics.spp, f"training pass {statistics.index + 1}")
+        return statistics
+
+    def _add(self, rendered: mi.TensorXf, spp: int, source: str) -> None:
+        image = to_numpy(rendered)
+        check_pixels(image, source)
+        self.image.add(image, spp)
+        self.brightness.add(np.mean(luminance(image)), spp)
+
+    def checkpoint(self, guide: Guide | None) -> None:
+        """Keep the image, if it is time to."""
+        budget, total = self.spec.budget, self.clock.total
+        limit = float(budget.spp or budget.seconds or 0)
+        spent = self.spent * limit
+        if self.targets is None:
+            self.targets = checkpoint_times(spent, limit, budget.checkpoints)
+        if spent >= limit or spent >= self.targets[0]:
+            self.targets = [t for t in self.targets if t > spent]
+            self.trace.append({
+                "seconds": total.charged, "train_seconds": self.clock["train"].charged,
+                "render_seconds": self.clock["render"].charged, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
+                "spp": self.image.spp, "records": guide.records if guide else 0, "particles": guide.particles if guide else 0})
+            self.checkpoints.append(self.image.mean.astype(np.float32))
+
+
 def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None = None,
             on_progress: Callable[[float, str], None] = lambda done, what: None) -> Measurement:
-    """Train, and render until the budget is spent.  The rule to stop does not look at the image.
+    """Train, and render until the budget is spent.
 
     Args:
         warm: from :func:`warm_up` of this scene and method in this process.
         guide: use it instead of training one.
-        on_progress: called off the clock (and after each training pass) with the share of the budget spent.
+        on_progress: called off the clock with the share of the budget spent.
 
     Raises:
         CellFailedError: a pixel that is NaN, infinite or negative.
     """
-    budget, spp = spec.budget, spp_of_pass(spec, warm)
-    clock = Clock(count_wait=environment.uses_llvm())
-    passes: list[dict[str, Any]] = []
+    spp, training = spp_of_pass(spec, warm), None
     with Kernels.watched() as kernels:
+        cell = _Cell(spec, kernels)
         if guide is None and spec.training is not None:
-            def on_pass(statistics: PassStatistics) -> None:
-                passes.append(dataclasses.asdict(statistics))
-                on_progress(0.0, f"training pass {statistics.index + 1} of {statistics.passes}")
-
-            with clock.lap("train", kernels.compiled):
-                guide = _train(spec, scene, spec.training, spec.seed, on_pass)
-
+            training = Training(scene, spec.method.representation or {}, spec.training, spec.integrator, spec.seed)
+            guide = training.radiance
+            for statistics in cell.train(training):
+                if cell.image.passes:
+                    cell.checkpoint(guide)
+                on_progress(min(1.0, cell.spent), f"training pass {statistics.index + 1} of {statistics.passes} at most")
         integrator = make_integrator(spec, guide)
-        counts = {"records": guide.records if guide else 0, "particles": guide.particles if guide else 0}
-        sum_of, brightness = Accumulator.empty(spec.scene.height, spec.scene.width), Accumulator.empty(1, 1)
-        trace: list[dict[str, Any]] = []
-        checkpoints: list[np.ndarray] = []
-        targets: list[float] | None = None
-        while True:
-            n = spp if budget.spp is None else power_of_two(min(spp, budget.spp - sum_of.spp))
-            seed = pass_seed(spec.seed, sum_of.passes)
-            with clock.lap("render", kernels.compiled):
-                rendered = render_pass(scene, integrator, seed, n)
-            image = to_numpy(rendered)
-            check_pixels(image, seed)
-            sum_of.add(image, n)
-            brightness.add(np.mean(luminance(image)), n)
+        while cell.spent < 1 or cell.image.passes == 0:
+            if training is not None and training.settings.while_rendering:
+                cell.render_and_learn(training)
+            else:
+                cell.render(scene, integrator, spp)
+            cell.checkpoint(guide)
+            on_progress(min(1.0, cell.spent), f"{cell.image.spp} spp")
 
-            spent, limit = (sum_of.spp, budget.spp) if budget.spp is not None else (clock.charged, budget.seconds or 0)
-            if targets is None:
-                targets = checkpoint_times(spent, limit, budget.checkpoints)
-            if spent >= limit or spent >= targets[0]:
-                targets = [t for t in targets if t > spent]
-                total = clock.total
-                trace.append({
-                    "seconds": total.charged, "train_seconds": clock["train"].charged,
-                    "render_seconds": clock["render"].charged, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
-                    "spp": sum_of.spp, **counts})
-                checkpoints.append(sum_of.mean.astype(np.float32))
-            on_progress(min(1.0, spent / limit), f"{sum_of.spp} spp")
-            if spent >= limit:
-                break
-
-    total, stderr = clock.total, math.sqrt(float(brightness.variance()[0, 0, 0]))
+    clock, total, image = cell.clock, cell.clock.total, cell.image
     info = {
-        "key": spec.key, "spp": sum_of.spp, "charged_seconds": total.charged, "train_seconds": clock["train"].charged,
+        "key": spec.key, "spp": image.spp, "charged_seconds": total.charged, "train_seconds": clock["train"].charged,
         "render_seconds": clock["render"].charged, "compile_seconds": warm.compile_seconds + kernels.seconds,
         "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
         "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
-        "trained": guide.trained if guide is not None else None,
-        **counts, "bytes_per_record": guide.bytes_per_record if guide is not None else 0, "invalid_pixels": 0,
-        "mean": float(brightness.mean[0, 0, 0]), "mean_stderr": stderr, "pass_spp": spp, "passes": passes,
+        "trained": guide.trained if guide is not None else None, "training_passes": len(cell.training),
+        "records": guide.records if guide is not None else 0, "particles": guide.particles if guide is not None else 0,
+        "bytes_per_record": guide.bytes_per_record if guide is not None else 0, "invalid_pixels": 0,
+        "mean": float(cell.brightness.mean[0, 0, 0]), "mean_stderr": math.sqrt(float(cell.brightness.variance()[0, 0, 0])),
+        "pass_spp": spp, "passes": cell.training,
     }
-    h, w, _ = sum_of.mean.shape
-    layers = {"mean": sum_of.mean, "variance": sum_of.variance(), "count": np.full((h, w), sum_of.spp, np.float32)}
-    return Measurement(info, trace, {k: v.astype(np.float32) for k, v in layers.items()}, checkpoints, guide)
+    h, w, _ = image.mean.shape
+    layers = {"mean": image.mean, "variance": image.variance(), "count": np.full((h, w), image.spp, np.float32)}
+    return Measurement(info, cell.trace, {k: v.astype(np.float32) for k, v in layers.items()}, cell.checkpoints, guide)
 
 
 def checkpoint_times(first: float, last: float, n: int) -> list[float]:
@@ -254,16 +304,19 @@ def checkpoint_times(first: float, last: float, n: int) -> list[float]:
     return [float(t) for t in np.geomspace(min(max(first, 1e-3 * last), last), last, n)] if n > 1 else [last]
 
 
-def check_pixels(image: np.ndarray, seed: int) -> None:
+def check_pixels(image: np.ndarray, source: str) -> None:
     """
+    Args:
+        source: of the image, for the message.
+
     Raises:
-        CellFailedError: a pixel of the pass with this seed is NaN, infinite or negative.
+        CellFailedError: a pixel is NaN, infinite or negative.
     """
     invalid = ~(np.isfinite(image) & (image >= 0)).all(axis=-1)
     if invalid.any():
         y, x = np.argwhere(invalid)[0]
         raise CellFailedError(f"{int(invalid.sum())} pixels are NaN, infinite or negative; the first is "
-                              f"x = {x}, y = {y}: {image[y, x].tolist()}, in the pass with seed {seed}")
+                              f"x = {x}, y = {y}: {image[y, x].tolist()}, in {source}")
 
 
 # ---------------------------------------------------------------- an experiment

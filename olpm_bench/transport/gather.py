@@ -59,6 +59,14 @@ def nearest(cache: RecordCache, particles: Particles, neighbours: int) -> Partic
     return _batch(cache, particles, place, record, mi.Float(1))
 
 
+def by_record(cache: RecordCache, particles: Particles) -> tuple[mi.UInt32, mi.UInt32]:
+    """All hits grouped by the record that their look-up gives: their places, and the offset of each record."""
+    p, _, _, _, n = particles.read(particles.place)
+    record, _, valid = cache.lookup(p, n, mi.Bool(True))
+    order, _, offset = group(dr.select(valid, record, dr.opaque(mi.UInt32, len(cache))), len(cache))
+    return dr.gather(mi.UInt32, particles.place, order), offset
+
+
 GATHERS = {"binned": binned, "nearest": nearest}
 
 

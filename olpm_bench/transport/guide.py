@@ -12,22 +12,29 @@ import numpy as np
 
 import representations
 from olpm_bench.transport.cache import RecordCache
+from olpm_bench.transport.estimates import Estimates
+from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.settings import InputError
 from representations import state as states
 from representations.interface import ParticleBatch
 
-FORMAT = 1              # of guide files
+FORMAT = 2              # of guide files
 MIN_PARTICLES = 80      # records that have seen fewer leave the surface to its BSDF; the mixture's first fit needs as many
 
 
 class GuidedPoint:
     """The distribution that serves a surface point, in world space.
 
-    `valid`: there is a record, and it has seen enough particles.
+    Attributes:
+        valid: there is a record, and it has seen enough particles.
+        fraction: its learnt BSDF fraction; 0: not learnt.
+        outgoing: the mean radiance that it returns; -1: not known.
     """
 
-    def __init__(self, guide: Guide, record: mi.UInt32, frame: mi.Frame3f, valid: mi.Bool) -> None:
-        self.guide, self.record, self.frame, self.valid = guide, record, frame, valid
+    def __init__(self, guide: Guide, record: mi.UInt32, frame: mi.Frame3f, found: mi.Bool) -> None:
+        self.guide, self.record, self.frame = guide, record, frame
+        row = dr.gather(mi.Vector4f, guide.rows, record, found)
+        self.valid, self.fraction, self.outgoing = row.x > 0, row.y, dr.select(found, row.z, -1)
 
     def sample(self, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Bool]:
         """A direction distributed by `pdf`, and whether there is one: samples may fail."""
@@ -45,13 +52,17 @@ class Guide:
     Args:
         cache: where the records are.
         specification: the representation, as in a TOML: ``{"type": "gaussian_mixture", "components": 8}``.
+        fraction: initial BSDF fraction of records that learn it; None: they do not.
     """
 
-    def __init__(self, cache: RecordCache, specification: dict[str, Any]) -> None:
-        self.cache, self.specification = cache, specification
+    def __init__(self, cache: RecordCache, specification: dict[str, Any], fraction: float | None = None) -> None:
+        self.cache, self.specification, self.fraction = cache, specification, fraction
         self.representation = representations.create(**specification)
         self.state = self.representation.init(0)
         self.count = dr.zeros(mi.UInt32, 0)     # particles seen by each record
+        self.estimates = Estimates.nothing(0)
+        self.rows = mi.Float()                  # [n_records * 4] for queries: has seen enough, fraction, outgoing; unused
+        self.pixels: PixelEstimate | None = None        # of the camera that the guide was trained for
         self.particles = 0                      # particles stored over all passes
 
     @property
@@ -70,10 +81,8 @@ class Guide:
 
     def at(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> GuidedPoint:
         """The distribution at a point with its normal, which looks to the side that light comes from."""
-        record, normal, valid = self.cache.lookup(p, n, active)
-        if self.records:
-            valid &= dr.gather(mi.UInt32, self.count, record, valid) >= MIN_PARTICLES
-        return GuidedPoint(self, record, mi.Frame3f(normal), valid)
+        record, normal, found = self.cache.lookup(p, n, active)
+        return GuidedPoint(self, record, mi.Frame3f(normal), found)
 
     # ---------------------- Learning ----------------------
 
@@ -83,24 +92,49 @@ class Guide:
         if added:
             self.state = states.append(self.state, self.representation.init(added, seed))
             self.count = states.join(self.count, dr.zeros(mi.UInt32, added))
-            dr.eval(self.state, self.count)
+            self.estimates = states.append(self.estimates, Estimates.nothing(added))
+            dr.eval(self.state, self.count, self.estimates)
+            self._tabulate()
 
-    def learn(self, batch: ParticleBatch, seed: int) -> None:
-        """One on-line update with the particles of one pass."""
-        if len(batch) == 0:
-            return
+    def learn_particles(self, batch: ParticleBatch, seed: int) -> None:
+        """One on-line update with the photons or importons of one pass."""
+        if len(batch):
+            self._update(self.estimates.normalise_particles(batch), seed)
+
+    def learn_camera(self, batch: ParticleBatch, seed: int) -> None:
+        """One on-line update with estimates of incident radiance from the camera paths of one pass."""
+        if len(batch):
+            self._update(self.estimates.normalise_camera(batch), seed)
+
+    def _update(self, batch: ParticleBatch, seed: int) -> None:
         self.state = self.representation.update(self.state, batch, seed)
         self.count = self.count + batch.count()
         self.particles += len(batch)
         dr.eval(self.state, self.count)
+        self._tabulate()
+
+    def learn_returned(self, returned: mi.Float, chosen_by_bsdf: mi.Float, offset: mi.UInt32) -> None:
+        """Update what the records return and their BSDF fraction; see :meth:`Estimates.learn`."""
+        self.estimates.learn(returned, chosen_by_bsdf, offset)
+        self._tabulate()
+
+    def _tabulate(self) -> None:
+        """Bring the rows for queries up to date."""
+        c = self.estimates.fraction(self.fraction) if self.fraction is not None else dr.zeros(mi.Float, self.records)
+        outgoing = self.estimates.outgoing(self.cache.points[:, :3])
+        self.rows = dr.ravel(mi.Vector4f(dr.select(self.count >= MIN_PARTICLES, mi.Float(1), 0), c, outgoing, 0))
+        dr.eval(self.rows)
 
     # ---------------------- Files ----------------------
 
     def save(self, path: str | Path) -> None:
         """Write the guide to a compressed ``.npz`` file."""
-        meta = {"format": FORMAT, "representation": self.specification, "particles": self.particles}
+        meta = {"format": FORMAT, "representation": self.specification, "fraction": self.fraction, "particles": self.particles}
         arrays = {f"cache.{k}": v for k, v in self.cache.to_numpy().items()}
         arrays |= {f"state.{k}": v for k, v in states.to_numpy(self.state).items()}
+        arrays |= {f"estimates.{k}": v for k, v in states.to_numpy(self.estimates).items()}
+        if self.pixels is not None:
+            arrays["pixels"] = self.pixels.luminance
         arrays |= {"meta": np.array(json.dumps(meta)), "count": self.count.numpy()}
         with open(path, "wb") as file:
             np.savez_compressed(file, **arrays)         # type: ignore[arg-type]
@@ -122,9 +156,14 @@ class Guide:
             meta = json.loads(str(arrays["meta"]))
             if meta["format"] > FORMAT:
                 raise InputError(f"{path}: guide format {meta['format']} is newer than this version's ({FORMAT})")
-            guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"])
+            if meta["format"] < FORMAT:
+                raise InputError(f"{path}: guide format {meta['format']} is of an older version (now {FORMAT}); train it anew")
+            guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"], meta["fraction"])
             guide.state = states.from_numpy(guide.state, part("state."))
+            guide.estimates = states.from_numpy(guide.estimates, part("estimates."))
+            guide.pixels = PixelEstimate(arrays["pixels"]) if "pixels" in arrays else None
             guide.count, guide.particles = mi.UInt32(arrays["count"]), meta["particles"]
+            guide._tabulate()
             return guide
         except (FileNotFoundError, PermissionError, IsADirectoryError, InputError, representations.RepresentationError):
             raise

@@ -5,7 +5,8 @@ from here, so sampler and weights cannot drift apart.  Particles scatter through
 
     p(wo) = c p_bsdf(wo) + (1 - c) p_guide(wo),    weight = f cos / p                          [T 76-77]
 
-c is the BSDF *fraction*; c = 1 where the BSDF is purely specular, or where the cache holds no trained record.
+c is the BSDF *fraction*, learnt record by record or fixed; c = 1 where the BSDF is purely specular, or where the cache
+holds no trained record.
 A specular component of a mixed BSDF can't be hit by the guide and keeps c times its own probability.
 """
 from __future__ import annotations
@@ -28,8 +29,12 @@ class GuidedBSDF:
         bsdf: the BSDF to be mixed.
         si: the surface interaction; `si.wi` decides on which side of the surface the guide is asked.
         guide: the learnt distributions; None, or one without records, leaves the BSDF alone.
-        fraction: probability c of sampling the BSDF where both can be used.
+        fraction: probability c of sampling the BSDF where both can be used and the guide has not learnt it.
         active: lanes in use.
+
+    Attributes:
+        outgoing: mean radiance (luminance) that the record's surface returns, without next-event estimation; < 0: not known.
+        chosen_by_bsdf: of the last sample, the probability that the BSDF chose it, c p_bsdf / p; -1 where c = 1.
     """
 
     def __init__(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, guide: Guide | None, fraction: float,
@@ -37,10 +42,13 @@ class GuidedBSDF:
         self.bsdf, self.si = bsdf, si
         self.smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         self.guided: GuidedPoint | None = None
+        self.outgoing, self.chosen_by_bsdf = mi.Float(-1), mi.Float(-1)
         if guide is not None and guide.records:
             n = dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))       # geometric normal, turned to the incident side
             self.guided = guide.at(si.p, n, self.smooth)
-            self.fraction = dr.select(self.guided.valid, mi.Float(fraction), 1)
+            learnt = self.guided.fraction
+            self.fraction = dr.select(self.guided.valid, dr.select(learnt > 0, learnt, fraction), 1)
+            self.outgoing = self.guided.outgoing
 
     def eval_pdf_sample(self, ctx: mi.BSDFContext, wo: mi.Vector3f, sample1: mi.Float, sample2: mi.Point2f,
                         active: mi.Bool) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
@@ -90,4 +98,5 @@ class GuidedBSDF:
         bs.sampled_type = dr.select(choose_bsdf, bs.sampled_type, mi.UInt32(+mi.BSDFFlags.GlossyReflection))
         bs.pdf = dr.select(specular, bsdf_pdf * self.fraction, self._mixture_pdf(bsdf_pdf, bs.wo))
         weight = dr.select(specular, weight / self.fraction, dr.select(bs.pdf > 0, value / bs.pdf, 0))
+        self.chosen_by_bsdf = dr.select(self.guided.valid, self.fraction * bsdf_pdf / bs.pdf, -1)
         return bs, weight & active

@@ -1,7 +1,8 @@
 """The guided path tracer: THE core loop.  Read this first.
 
-A unidirectional path tracer with next-event estimation, as Mitsuba's `path`; the one difference is that it scatters
-through :class:`~olpm_bench.transport.guided_bsdf.GuidedBSDF`.  Without a guide that is the BSDF, and this is `path`.
+A unidirectional path tracer with next-event estimation, as Mitsuba's `path`.  Two things differ: it scatters through
+:class:`~olpm_bench.transport.guided_bsdf.GuidedBSDF`, and it ends paths by their expected contribution
+(:mod:`~olpm_bench.transport.roulette`).  Without a guide these are the BSDF and roulette on throughput, and this is `path`.
 """
 from __future__ import annotations
 
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from olpm_bench.transport import roulette
+from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
 from olpm_bench.transport.settings import IntegratorSettings
 
@@ -25,7 +28,7 @@ def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(pdf_b / pdf_a)), 0)
 
 
-class GuidedPathIntegrator(mi.SamplingIntegrator):
+class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
     """Path tracing guided by learnt directional distributions of incident radiance.
 
     Args:
@@ -39,17 +42,54 @@ class GuidedPathIntegrator(mi.SamplingIntegrator):
         self.settings = settings or IntegratorSettings()
         self.guide = guide
 
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """An image, as `mi.render` asks for it."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        return self.render_paths(scene, sensor, seed, spp)
+
+    def render_paths(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int,
+                     log: CameraPaths | None = None) -> mi.TensorXf:
+        """An image, and if asked for the vertices of its paths.
+
+        Args:
+            log: keeps the vertices; of as many paths as the image has samples.
+        """
+        film = sensor.film()
+        with dr.suspend_grad():
+            sampler, _ = self.prepare(sensor, dr.opaque(mi.UInt32, seed), spp)
+            ray, weight, position = self.sample_rays(scene, sensor, sampler)
+            uv = (position - film.crop_offset()) / mi.Vector2f(film.crop_size())
+            L, valid, _ = self.walk(scene, sampler, ray, True, mi.Point2f(uv), log)
+            block = film.create_block()
+            self._splat(block, film, position, L * weight, dr.select(valid, mi.Float(1), 0), ray)
+            film.put_block(block)
+            if log is not None:
+                dr.schedule(*log.arrays())
+            return film.develop()
+
+    @staticmethod
+    def _splat(block, film, position, value, alpha, ray):
+        mi.ad.integrators.common.ADIntegrator._splat_to_block(block, film, position, value, 1.0, alpha, [], ray.wavelengths)
+
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Radiance along camera rays, as Mitsuba asks for it."""
+        """Radiance along camera rays, for those who ask without a film."""
         L, valid, _ = self.walk(scene, sampler, ray, active)
         return L, valid, []
 
     @dr.syntax
-    def walk(self, scene, sampler, ray, active):
-        """Trace paths; returns their radiance, whether they hit anything, and their number of vertices."""
+    def walk(self, scene, sampler, ray, active, position=None, log=None):
+        """Trace paths; returns their radiance, whether they hit anything, and their number of vertices.
+
+        Args:
+            position: of the rays on the film in [0, 1]^2, for the roulette's pixel estimate; None: there is none.
+            log: keeps the vertices.
+        """
+        guide, fraction, rr_depth, window = self.guide, self.settings.fraction, self.settings.rr_depth, self.settings.window
         max_depth = self.settings.max_depth if self.settings.max_depth >= 0 else 0xFFFFFFFF
-        rr_depth = self.settings.rr_depth if self.settings.roulette == "throughput" else 0xFFFFFFFF
-        fraction, guide = self.settings.fraction, self.guide
+        estimate = guide.pixels if guide is not None and self.settings.roulette == "contribution" else None
+        pixel = estimate.at(position) if estimate is not None and position is not None else None
+        end_paths, by_contribution = self.settings.roulette != "none", pixel is not None
+        worth = window * pixel if pixel is not None else mi.Float(0)        # what a path is worth to its pixel
         ctx = mi.BSDFContext()
 
         ray = mi.Ray3f(ray)
@@ -70,7 +110,10 @@ class GuidedPathIntegrator(mi.SamplingIntegrator):
             ds = mi.DirectionSample3f(scene, si, si_prev)
             emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, active & ~delta_prev)
             visible = active & ~((depth == 0) & self.hide_emitters)
-            L[visible] += beta * mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, visible)
+            emitted = mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, visible) & visible
+            L += beta * emitted
+            if dr.hint(log is not None, mode="scalar"):
+                log.arrive(depth, ray, si.t, emitted, active)
 
             # Emitters on the surface are hit even at the last depth; everything below needs one more segment.
             active_next = active & si.is_valid() & (depth + 1 < max_depth)
@@ -85,7 +128,22 @@ class GuidedPathIntegrator(mi.SamplingIntegrator):
             value, pdf_em, bs, weight = bsdf.eval_pdf_sample(
                 ctx, si.to_local(ds.d), sampler.next_1d(active_next), sampler.next_2d(active_next), active_next)
             mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_em))
-            L[active_em] += beta * value * weight_em * mis_em
+            reflected = value * weight_em * mis_em & active_em
+            L += beta * reflected
+
+            # ---------------------- Roulette ----------------------
+            survive = mi.Float(1)                       # probability of going on
+            if dr.hint(end_paths, mode="scalar"):
+                survive = roulette.by_throughput(beta * weight, eta * bs.eta, depth + 1 >= rr_depth)
+            if dr.hint(by_contribution, mode="scalar"):
+                known = (bsdf.outgoing >= 0) & (depth > 0)
+                survive = dr.select(known, roulette.by_contribution(beta, bsdf.outgoing, worth), survive)
+            active_next &= dr.max(weight) > 0
+            survives = (survive == 1) | (sampler.next_1d(active_next & (survive < 1)) < survive)
+            active_next &= survives
+            weight = dr.select(active_next, weight / survive, 0)
+            if dr.hint(log is not None, mode="scalar"):
+                log.leave(depth, si, bsdf, bs, weight, survive, reflected, active & si.is_valid())
 
             # ---------------------- Update loop variables ----------------------
             ray = si.spawn_ray(si.to_world(bs.wo))
@@ -96,15 +154,7 @@ class GuidedPathIntegrator(mi.SamplingIntegrator):
             delta_prev = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             valid_ray |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
             depth[active & si.is_valid()] += 1
-
-            # ---------------------- Stopping criterion ----------------------
-            beta_max = dr.max(beta)
-            active = active_next & (beta_max != 0)
-            survive = dr.minimum(beta_max * dr.square(eta), 0.95)       # cancels the eta^2 of refraction
-            roulette = active & (depth >= rr_depth)
-            survives = sampler.next_1d(roulette) < survive
-            beta[roulette] *= dr.rcp(survive)
-            active &= ~roulette | survives
+            active = active_next
 
         return L & valid_ray, valid_ray, depth
 

@@ -31,20 +31,21 @@ class GuidedPathPlugin(GuidedPathIntegrator):
         self.training_seed = given.pop("seed", 0)
         integrator, training = ({f.name: given[f.name] for f in dataclasses.fields(cls) if f.name in given}
                                 for cls in (options.IntegratorSettings, options.TrainingSettings))
-        self.training_settings = options.training(given.pop("preset", "fast"), **training)
+        preset = given.pop("preset", "best")
+        self.training_settings = options.training(preset, **training)
         hyper_parameters = {k: v for k, v in given.items() if k not in integrator and k not in training}
         self.specification: dict[str, Any] | None = None
         if representation != "unguided":
             self.specification = {"type": representation, **hyper_parameters}
             representations.create(**self.specification)            # a wrong name or parameter is found here
-        super().__init__(options.IntegratorSettings(**integrator), props=props)
+        super().__init__(options.integrator(preset, **integrator), props=props)
         self.trained_for: tuple[mi.Scene, mi.Sensor] | None = None
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         view = scene, scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         if self.specification is not None and self.trained_for != view:
-            self.guide = train(scene, self.specification, self.training_settings, max_depth=self.settings.max_depth,
-                               seed=self.training_seed, sensor=view[1])
+            self.guide = train(scene, self.specification, self.training_settings, self.settings, seed=self.training_seed,
+                               sensor=view[1])
             self.trained_for = view
         return super().render(scene, sensor, seed, spp, develop, evaluate)
 

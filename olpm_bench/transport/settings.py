@@ -6,6 +6,7 @@ TOML, of ``--set`` and of the Mitsuba plugin are these names.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -35,92 +36,127 @@ class IntegratorSettings:
     """The guided path tracer.
 
     max_depth: longest path in segments, as Mitsuba counts: 1 shows emitters only, 2 adds direct light; -1 has no limit.
-    roulette: "none" leaves all paths alone: guided ones carry low throughput for a reason; "throughput" ends them by it
-        from vertex `rr_depth` on, as Mitsuba's `path` does.
-    fraction: probability of sampling the BSDF rather than the guide where both can be used [T 76-77: 0.5].
+    roulette: "contribution" ends paths by what they can still be expected to bring to their pixel (adjoint-driven, Vorba
+        & Křivánek 2016), and where nothing is known of that, so without a guide, by throughput; "throughput" ends them by it
+        from vertex `rr_depth` on, as Mitsuba's `path` does; "none" leaves all paths alone.
+    rr_depth: see above [vertices].
+    window: "contribution" lets paths live that are expected to bring at least this share of their pixel's radiance.
+    fraction: probability of sampling the BSDF rather than the guide where both can be used and it is not learnt [T 76-77: 0.5].
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
     max_depth: int = 13
-    roulette: Literal["none", "throughput"] = "none"
+    roulette: Literal["contribution", "throughput", "none"] = "contribution"
     rr_depth: int = 5
+    window: float = 0.5
     fraction: float = 0.5
 
     def __post_init__(self) -> None:
         _require_types(self)
         _require(self.max_depth >= 1 or self.max_depth == -1, "max_depth", self.max_depth, ">= 1, or -1 for no limit")
-        _require(self.roulette in ("throughput", "none"), "roulette", self.roulette, "'throughput' or 'none'")
+        _require_choice(self, "roulette", "contribution", "throughput", "none")
         _require(self.max_depth >= 1 or self.roulette != "none", "max_depth", self.max_depth, ">= 1 without roulette")
         _require(self.rr_depth >= 1, "rr_depth", self.rr_depth, ">= 1")
+        _require(0 < self.window < math.inf, "window", self.window, "> 0")
         _require(0 < self.fraction <= 1, "fraction", self.fraction, "in (0, 1]")
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a guide is trained.
+    """How a guide is trained: first `passes` passes of particles, then `camera_passes` passes of camera paths.
 
     schedule: "interleaved" alternates importons and photons for `passes` passes, each with one on-line update;
         "single_batch" traces passes * photons photons without guiding and fits once (slides 51-52).
-    passes: training passes; 0 leaves the guide untrained, which is plain BSDF sampling.
-    photons, importons: paths emitted in a pass.
+    passes: particle passes; without these and camera passes the guide stays untrained, which is plain BSDF sampling.
+    photons, importons: paths emitted in a particle pass.
+    camera_passes: at most so many passes of camera paths, which render the image and teach the guide.
+    camera_paths: paths of such a pass: as many samples a pixel, rounded to a power of two, as come nearest; at least one.
+    share: of a budget in seconds, after which training ends; 1 trains all passes whatever they take.
+    blend: let the images of camera passes of the second half of training into the result, sample for sample.
+    while_rendering: go on learning from the paths of every rendering pass.
     gather: "binned": the particles whose look-up gives the record, at most `neighbours` of them;
-        "nearest": exactly the `neighbours` nearest within the record radius, as in the paper.
+        "nearest": exactly the `neighbours` nearest within the record radius, as in the paper.  (Camera paths are binned.)
     neighbours: particles of a pass used by a record [L: 250].
     record_radius: validity radius of a record, in units of the scene's diagonal [L: 0.01].
     fraction: probability of sampling the BSDF rather than the guide when particles scatter.
+    learn_fraction: learn it from camera paths, record by record, for camera paths and importons.
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
     schedule: Literal["interleaved", "single_batch"] = "interleaved"
-    passes: int = 5
+    passes: int = 3
     photons: int = 300_000
     importons: int = 100_000
+    camera_passes: int = 24
+    camera_paths: int = 2 ** 17
+    share: float = 0.35
+    blend: bool = True
+    while_rendering: bool = False
     gather: Literal["binned", "nearest"] = "binned"
     neighbours: int = 250
     record_radius: float = 0.02
     fraction: float = 0.5
+    learn_fraction: bool = True
 
     def __post_init__(self) -> None:
         _require_types(self)
-        _require(self.schedule in ("interleaved", "single_batch"), "schedule", self.schedule, "'interleaved' or 'single_batch'")
-        _require(self.gather in ("binned", "nearest"), "gather", self.gather, "'binned' or 'nearest'")
-        for name in ("passes", "importons"):
+        _require_choice(self, "schedule", "interleaved", "single_batch")
+        _require_choice(self, "gather", "binned", "nearest")
+        for name in ("passes", "importons", "camera_passes"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), ">= 0")
-        for name in ("photons", "neighbours"):
+        for name in ("photons", "camera_paths", "neighbours"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), ">= 1")
+        _require(0 < self.share <= 1, "share", self.share, "in (0, 1]")
         _require(0 < self.record_radius <= 0.25, "record_radius", self.record_radius, "in (0, 0.25] of the scene's diagonal")
         _require(0 < self.fraction <= 1, "fraction", self.fraction, "in (0, 1]")
 
 
-PRESETS: dict[str, dict[str, Any]] = {
-    # The fast gather and records that fill at few particles: what pays at equal time on two cores.
-    "fast": {},
-    # The talk's own particles and gather [T, L]; its records also shrink near sources, ours do not.
-    "paper2014": {"gather": "nearest", "record_radius": 0.01, "photons": 300_000, "importons": 300_000},
+def _require_choice(settings: Any, name: str, *choices: str) -> None:
+    *most, last = map(repr, choices)
+    _require(getattr(settings, name) in choices, name, getattr(settings, name), f"{', '.join(most)} or {last}")
+
+
+# What each preset changes of the defaults, which are those of `best`.
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "best": {"training": {}, "integrator": {}},
+    # The talk's own particles, gather and roulette [T, L].
+    "paper2014": {"training": {"gather": "nearest", "record_radius": 0.01, "passes": 10, "importons": 300_000, "camera_passes": 0,
+                               "learn_fraction": False},
+                  "integrator": {"roulette": "throughput"}},
+    # The same without roulette, which kills guided paths: they carry low throughput for a reason.
+    "paper2014_norr": {"training": {"gather": "nearest", "record_radius": 0.01, "passes": 10, "importons": 300_000,
+                                    "camera_passes": 0, "learn_fraction": False},
+                       "integrator": {"roulette": "none"}},
 }
 
 Settings = TypeVar("Settings")
 
 
-def training(preset: str = "fast", **changes: Any) -> TrainingSettings:
-    """The settings of a preset, with changes.
+def training(preset: str = "best", **changes: Any) -> TrainingSettings:
+    """The training settings of a preset, with changes.
 
     Raises:
         InputError: unknown preset or key, or a value of a wrong type or out of its range.
     """
-    return with_changes(TrainingSettings(), without_preset({"preset": preset, **changes}))
+    return with_changes(TrainingSettings(), {**preset_of(preset)["training"], **changes})
 
 
-def without_preset(table: dict[str, Any]) -> dict[str, Any]:
-    """Training settings with their `preset`, if they have one, replaced by its values; the table's other keys win.
+def integrator(preset: str = "best", **changes: Any) -> IntegratorSettings:
+    """The integrator settings of a preset, with changes.
+
+    Raises:
+        InputError: as `training`.
+    """
+    return with_changes(IntegratorSettings(), {**preset_of(preset)["integrator"], **changes})
+
+
+def preset_of(name: Any) -> dict[str, dict[str, Any]]:
+    """What a preset changes: its tables `training` and `integrator`.
 
     Raises:
         InputError: unknown preset.
     """
-    if "preset" not in table:
-        return table
-    preset = table["preset"]
-    if not isinstance(preset, str) or preset not in PRESETS:
-        raise InputError(f"unknown preset {preset!r}; known: {', '.join(PRESETS)}")
-    return {**PRESETS[preset], **{k: v for k, v in table.items() if k != "preset"}}
+    if not isinstance(name, str) or name not in PRESETS:
+        raise InputError(f"unknown preset {name!r}; known: {', '.join(PRESETS)}")
+    return PRESETS[name]
 
 
 def with_changes(settings: Settings, changes: dict[str, Any]) -> Settings:

@@ -1,18 +1,20 @@
-"""Training: importons and photons teach each other where to go [T 70-91].
+"""Training: importons and photons teach each other where to go [T 70-91], and then camera paths where light comes from.
 
-    for each training pass:
+    for each particle pass:
         trace importons from the camera, guided by radiance      -> update the importance guide
         trace photons from the emitters, guided by importance    -> update the radiance guide
+    for each camera pass:
+        render an image, guided by radiance                      -> update the radiance guide
     render with the radiance guide
 
 Each trace is followed by one gather and one on-line update, after which its particles are dropped: memory does not
-grow with the number of passes.
+grow with the number of passes.  The images of camera passes are unbiased, since a pass learns nothing before its end.
 """
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import drjit as dr
@@ -20,10 +22,14 @@ import mitsuba as mi
 import numpy as np
 
 from olpm_bench.transport.cache import RecordCache
-from olpm_bench.transport.gather import GATHERS
+from olpm_bench.transport.camera_paths import CameraPaths
+from olpm_bench.transport.gather import GATHERS, binned, by_record
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
-from olpm_bench.transport.settings import InputError, TrainingSettings
+from olpm_bench.transport.roulette import PixelEstimate
+from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings
+
+LUMINANCE = (0.212671, 0.715160, 0.072169)      # of linear sRGB, as mi.luminance
 
 
 @dataclass
@@ -33,21 +39,31 @@ class PassStatistics:
     passes: int
     photons: int = 0
     importons: int = 0
-    stored: int = 0                 # photon hits
-    kept: int = 0                   # photons that taught a record
+    spp: int = 0                    # of the image that a camera pass rendered
+    stored: int = 0                 # hits of photons, or vertices of camera paths
+    kept: int = 0                   # of which taught a record
     records: int = 0                # of the radiance guide
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("trace", "grow", "gather", "update"), 0.0))
+    image: mi.TensorXf | None = field(default=None, repr=False)
+
+    def share(self, part: str) -> float:
+        """Of the seconds, those that a part took."""
+        return self.seconds[part] / max(sum(self.seconds.values()), 1e-9)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: all but the image."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "image"}
 
 
 def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixture",
-          settings: TrainingSettings | None = None, *, max_depth: int = 13, seed: int = 0,
+          settings: TrainingSettings | None = None, integrator: IntegratorSettings | None = None, *, seed: int = 0,
           sensor: mi.Sensor | None = None, on_pass: Callable[[PassStatistics], None] | None = None) -> Guide:
     """Train a guide for camera paths; see :class:`Training` for the arguments.
 
     Args:
         on_pass: called with the statistics of each pass.
     """
-    training = Training(scene, representation, settings or TrainingSettings(), max_depth, seed, sensor)
+    training = Training(scene, representation, settings or TrainingSettings(), integrator or IntegratorSettings(), seed, sensor)
     for statistics in training.run():
         if on_pass is not None:
             on_pass(statistics)
@@ -96,7 +112,7 @@ class Training:
         scene: any Mitsuba scene with an emitter and a camera.
         representation: a registered name, or as in a TOML ``{"type": "gaussian_mixture", "components": 8}``.
         settings: passes, particles, gather, ...
-        max_depth: of the paths to be guided.
+        integrator: that will use the guide: depth, roulette and fraction of the camera passes.
         seed: everything random follows from it.
         sensor: the camera, from which importons start; the scene's first by default.
 
@@ -104,22 +120,40 @@ class Training:
         InputError: the scene can't be guided; the message says why.
     """
 
-    def __init__(self, scene: mi.Scene, representation: str | dict[str, Any], settings: TrainingSettings, max_depth: int,
-                 seed: int = 0, sensor: mi.Sensor | None = None) -> None:
+    def __init__(self, scene: mi.Scene, representation: str | dict[str, Any], settings: TrainingSettings,
+                 integrator: IntegratorSettings, seed: int = 0, sensor: mi.Sensor | None = None) -> None:
+        from olpm_bench.transport.path import GuidedPathIntegrator  # whose base class exists once a variant is set
+
         check_traceable(scene)
-        self.scene, self.settings, self.max_depth, self.seed = scene, settings, max_depth, seed
+        self.scene, self.settings, self.max_depth, self.seed = scene, settings, integrator.max_depth, seed
         specification = {"type": representation} if isinstance(representation, str) else dict(representation)
-        self.radiance, self.importance = (Guide(RecordCache(surface_bounds(scene), settings.record_radius), specification)
-                                          for _ in range(2))
+        bounds = surface_bounds(scene)
+        self.radiance = Guide(RecordCache(bounds, settings.record_radius), specification,
+                              integrator.fraction if settings.learn_fraction else None)
+        self.importance = Guide(RecordCache(bounds, settings.record_radius), specification)
+        self.integrator = GuidedPathIntegrator(integrator, self.radiance)
+        self.luminance: np.ndarray | None = None        # of the mean of all camera passes so far (h, w), ...
+        self.spp = 0                                    # ... and their samples a pixel
         self.sensor = sensor or scene.sensors()[0]
         self.sampler = mi.load_dict({"type": "independent"})
         self.draws = 0                      # seeds used so far
 
     def run(self) -> Iterator[PassStatistics]:
-        """Train as the settings say, one pass at each step."""
-        step = {"interleaved": self._interleaved, "single_batch": self._single_batch}[self.settings.schedule]
-        for index in range(1 if self.settings.schedule == "single_batch" and self.settings.passes else self.settings.passes):
-            yield step(PassStatistics(index, self.settings.passes))
+        """Train as the settings say, one pass at each step.  Who stops early has a guide as good as the passes done."""
+        particle_pass = {"interleaved": self._interleaved, "single_batch": self._single_batch}[self.settings.schedule]
+        for index in range(self.passes):
+            step = particle_pass if index < self.passes - self.settings.camera_passes else self._camera_pass
+            yield step(PassStatistics(index, self.passes))
+
+    @property
+    def passes(self) -> int:
+        """Of particles and of camera paths together."""
+        particles = min(self.settings.passes, 1) if self.settings.schedule == "single_batch" else self.settings.passes
+        return particles + self.settings.camera_passes
+
+    def camera_pass(self) -> PassStatistics:
+        """One more pass of camera paths, after or beside those of `run`."""
+        return self._camera_pass(PassStatistics(self.passes, self.passes))
 
     def _interleaved(self, statistics: PassStatistics) -> PassStatistics:
         """Importons, then photons, each guided by what the other has learnt so far."""
@@ -158,8 +192,43 @@ class Training:
         with _Seconds(statistics, "gather"):
             batch = GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours)
         with _Seconds(statistics, "update"):
-            guide.learn(batch, self._next_seed())
+            guide.learn_particles(batch, self._next_seed())
         return len(batch)
+
+    def _camera_pass(self, statistics: PassStatistics) -> PassStatistics:
+        """Render an image with the guide as it is, and learn from its paths."""
+        film = self.sensor.film()
+        pixels = int(np.prod(film.crop_size() + 2 * film.rfilter().border_size() * film.sample_border()))
+        spp = 1 << max(0, round(np.log2(self.settings.camera_paths / pixels)))
+        paths = CameraPaths(pixels, spp, self.max_depth)
+        with _Seconds(statistics, "trace"):
+            image = self.integrator.render_paths(self.scene, self.sensor, self._next_seed(), spp, paths)
+            dr.eval(image)
+            paths.propagate()
+        vertices, guide = paths.particles(), self.radiance
+        if len(vertices):
+            with _Seconds(statistics, "grow"):
+                p, _, _, _, n = vertices.read(vertices.place)
+                guide.grow(p, n, mi.Bool(True), self._next_seed())
+            with _Seconds(statistics, "gather"):
+                batch = binned(guide.cache, vertices, self.settings.neighbours)
+                place, offset = by_record(guide.cache, vertices)
+            with _Seconds(statistics, "update"):
+                guide.learn_returned(*paths.returned(place), offset)
+                guide.learn_camera(batch, self._next_seed())
+            statistics.kept = len(batch)
+        self._estimate_pixels(image, spp)
+        statistics.spp, statistics.stored, statistics.image = spp, len(vertices), image
+        statistics.records = guide.records
+        return statistics
+
+    def _estimate_pixels(self, image: mi.TensorXf, spp: int) -> None:
+        """Tell the guide what pixels are worth, from all camera passes so far."""
+        luminance = np.asarray(image.numpy(), np.float64)[..., :3] @ LUMINANCE
+        before = 0.0 if self.luminance is None else self.luminance
+        self.spp += spp
+        self.luminance = before + (luminance - before) * spp / self.spp
+        self.radiance.pixels = PixelEstimate(self.luminance)
 
     def _next_seed(self) -> int:
         self.draws += 1

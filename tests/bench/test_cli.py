@@ -232,7 +232,7 @@ RENDER = ("render", "cornell_box", "--spp", "1", "--out", "x.exr")
      ["--set representation.resolution", "trained already"]),
     ((*RENDER, "--method", "jensen", "--load-guide", "g.npz", "--set", "training.passes=8"),
      ["--set training.passes", "trained already"]),
-    ((*RENDER, "--method", "cosine", "--set", "training.preset=['a']"), ["unknown preset ['a']", "fast, paper2014"]),
+    ((*RENDER, "--method", "cosine", "--set", "training.preset=['a']"), ["unknown preset ['a']", "best, paper2014"]),
     ((*RENDER, "--method", "unguided", "--set", "scene.light_size=7"), ["light_size = 7.0", "[0.01, 1.9]"]),
     (("run", "wide.toml", "--dry-run"), ["light_size = 9.0", "[0.01, 1.9]"]),
     (("run", "broken.toml"), ["broken.py", "cannot be loaded: SyntaxError"]),

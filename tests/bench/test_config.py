@@ -49,7 +49,7 @@ def test_what_is_written_and_what_is_the_default(tmp_path):
     scene, (unguided, cosine) = experiment.scene[0], experiment.method
     assert experiment.training_of(unguided) is None
     assert experiment.training_of(cosine).passes == 2
-    assert experiment.integrator_of(scene, unguided).roulette == "none"
+    assert experiment.integrator_of(scene, unguided).roulette == "contribution"
     assert experiment.integrator_of(scene, cosine).roulette == "throughput"
     assert experiment.path == tmp_path / "test.toml"
 
@@ -73,6 +73,21 @@ def test_presets_apply_before_changes(tmp_path):
     assert own.training_of(own.method[1]).gather == "nearest" and own.training_of(own.method[1]).photons == 7
 
 
+def test_presets_bring_their_roulette(tmp_path):
+    """A method's own words win over its preset's, those over the experiment's, and those over the experiment's preset's."""
+    def roulettes(training: str = "", integrator: str = "", own: str = "") -> list[str]:
+        text = MINIMAL.replace("passes = 2", training).replace('integrator = { roulette = "throughput" }', own)
+        experiment = load(tmp_path, text + f"[integrator]\n{integrator}\n")
+        return [experiment.integrator_of(experiment.scene[0], method).roulette for method in experiment.method]
+
+    preset = 'preset = "paper2014_norr"'
+    assert roulettes() == ["contribution"] * 2
+    assert roulettes(preset) == ["contribution", "none"]                    # the unguided method has no preset
+    assert roulettes(preset, 'roulette = "throughput"') == ["throughput"] * 2
+    assert roulettes(integrator='roulette = "throughput"', own=f"training = {{ {preset} }}") == ["throughput", "none"]
+    assert roulettes(preset, own='integrator = { roulette = "throughput" }') == ["contribution", "throughput"]
+
+
 @pytest.mark.parametrize("old, new, words", [
     ("seeds = 2", "sedes = 2", ["unknown key 'sedes' in test.toml", "known:", "seeds"]),
     ("spp = 8", "spps = 8", ["unknown key 'spps' in test.toml [budget]", "seconds, spp, checkpoints"]),
@@ -92,7 +107,7 @@ def test_presets_apply_before_changes(tmp_path):
     ('title = "Test"', "", ["missing key 'title' in test.toml"]),
     ("passes = 2", "photons = -3", ["[training]", "photons = -3", ">= 1"]),
     ("passes = 2", 'passes = "2"', ["[training]", "passes", "'2'"]),
-    ("passes = 2", 'preset = "slow"', ["[training]", "unknown preset 'slow'", "fast, paper2014"]),
+    ("passes = 2", 'preset = "slow"', ["[training]", "unknown preset 'slow'", "best, paper2014"]),
     ("seeds = 2", "seeds = 0", ["seeds = 0", "must be 1 to"]),
     ("seeds = 2", "seeds = [1, 1]", ["seeds", "different"]),
     ("seeds = 2", "seeds = [-1]", ["seeds", "0 to"]),
@@ -110,10 +125,10 @@ def test_presets_apply_before_changes(tmp_path):
     ("width = 16", 'width = 16\nfile = "no.xml"', ["no.xml", "no such file", "--scene"]),
     ("width = 16", 'width = 16\nreference = "no.exr"', ["no.exr", "no such file"]),
     ("width = 16", "width = 16\nmax_depth = 0", ["max_depth = 0", ">= 1, or -1"]),
-    ("passes = 2", "preset = ['fast']", ["[training]", "unknown preset ['fast']", "fast, paper2014"]),
+    ("passes = 2", "preset = ['best']", ["[training]", "unknown preset ['best']", "best, paper2014"]),
     ('roulette = "throughput"', 'rr_depth = "two"', ["'Cosine' integrator", "rr_depth = 'two'", "a whole number"]),
-    ('representation = { type = "cosine" }', 'representation = { type = "cosine" }\ntraining = { preset = ["fast"] }',
-     ["'Cosine' training", "unknown preset ['fast']"]),
+    ('representation = { type = "cosine" }', 'representation = { type = "cosine" }\ntraining = { preset = ["best"] }',
+     ["'Cosine' training", "unknown preset ['best']"]),
     ("passes = 2", "photons = 2.5", ["[training]", "photons", "2.5"]),
     ("width = 16", "width = 16\nparameters = { light_size = 3 }", ["'cornell_box'", "light_size = 3.0", "[0.01, 1.9]"]),
     ("spp = 8", "spp = ", ["test.toml is not valid TOML", "line 5"]),

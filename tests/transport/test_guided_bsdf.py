@@ -45,6 +45,7 @@ class OneRecord:
 
     def __init__(self, failure: float) -> None:
         self.representation = UniformHemisphere(failure)
+        self.rows = mi.Float(1, 0, -1, 0)       # has seen enough; nothing learnt of the fraction and of what it returns
 
     def at(self, p, n, active):
         return GuidedPoint(self, mi.UInt32(0), mi.Frame3f(n), mi.Bool(active))

@@ -8,7 +8,7 @@ import pytest
 from small_scenes import box, furnace, grey, lamp
 
 from olpm_bench.transport.particles import emit_importons, emit_photons, trace
-from olpm_bench.transport.settings import TrainingSettings
+from olpm_bench.transport.settings import IntegratorSettings, TrainingSettings
 from olpm_bench.transport.training import Training
 
 ALBEDO, DEPTH, N = 0.6, 7, 100_000
@@ -43,8 +43,8 @@ def test_flux_of_a_closed_box(scene, guided):
     """A box of albedo a: of the flux Phi, Phi a^(k-1) arrives at vertex k.  Kept are vertices 2 to DEPTH - 1."""
     guide = None
     if guided:
-        settings = TrainingSettings(passes=2, photons=20_000, importons=20_000, record_radius=0.08)
-        training = Training(scene, "jensen", settings, DEPTH)
+        settings = TrainingSettings(passes=2, camera_passes=0, photons=20_000, importons=20_000, record_radius=0.08)
+        training = Training(scene, "jensen", settings, IntegratorSettings(max_depth=DEPTH))
         for _ in training.run():
             pass
         guide = training.importance

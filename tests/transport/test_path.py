@@ -9,9 +9,10 @@ from small_scenes import assert_same_expectation, box, furnace, grey, lamp, pass
 import olpm_bench
 import representations
 from olpm_bench.transport import settings
+from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.training import Training
 
-TRAINING = {"passes": 2, "photons": 20_000, "importons": 10_000, "record_radius": 0.08}
+TRAINING = {"passes": 2, "photons": 20_000, "importons": 10_000, "record_radius": 0.08, "camera_passes": 2, "camera_paths": 2**14}
 DEPTH = 8
 
 
@@ -59,7 +60,7 @@ def test_guided_and_unguided_agree_with_mitsuba(name, mitsuba_path):
     expected = passes(scene, mitsuba_path, seed=1000)
     assert_same_expectation(passes(scene, olpm_bench.integrator(max_depth=DEPTH, roulette="throughput")), expected)
     guide = olpm_bench.train(scene, "gaussian_mixture", max_depth=DEPTH, **TRAINING)
-    for roulette in ("none", "throughput"):
+    for roulette in ("contribution", "none"):
         guided = olpm_bench.integrator(guide, max_depth=DEPTH, roulette=roulette)
         assert_same_expectation(passes(scene, guided, seed=2000), expected)
 
@@ -95,13 +96,13 @@ def test_furnace(representation, garbage):
     """Radiance 1 / (1 - a) everywhere, whatever the guide believes."""
     albedo = 0.5
     scene = furnace(albedo)
-    guide = Training(scene, representation, settings.training(**TRAINING), max_depth=DEPTH)
+    guide = Training(scene, representation, settings.training(**TRAINING), settings.integrator(max_depth=DEPTH))
     for _ in guide.run():
         pass
     guide = guide.radiance
     if garbage:
         _teach_garbage(guide)
-    image = passes(scene, olpm_bench.integrator(guide, max_depth=40, roulette="throughput", rr_depth=8), n=16, spp=256)
+    image = passes(scene, olpm_bench.integrator(guide, max_depth=40, rr_depth=8), n=16, spp=256)
     assert np.isfinite(image).all() and (image >= 0).all()
     mean, error = image.mean(), image.mean((1, 2, 3)).std(ddof=1) / 4
     assert abs(mean - 1 / (1 - albedo)) < 4 * error + 1e-4
@@ -110,15 +111,18 @@ def test_furnace(representation, garbage):
 
 
 def _teach_garbage(guide):
-    """A batch of particles that has nothing to do with the light: one random direction a record, of wild weights."""
+    """Particles that have nothing to do with the light, one random direction a record, of wild weights; wild estimates, too."""
     from representations.interface import ParticleBatch
     rng = np.random.default_rng(9)
     n, each = guide.records, 100
     lobe = rng.normal(size=(n, 1, 3)) + 0.1 * rng.normal(size=(n, each, 3))
     lobe[..., 2] = np.abs(lobe[..., 2])
     wo = (lobe / np.linalg.norm(lobe, axis=-1, keepdims=True)).reshape(-1, 3)
-    guide.learn(ParticleBatch.from_arrays(mi.Vector3f(wo.T), mi.Float(rng.lognormal(0, 2, n * each)),
-                                          mi.UInt32(np.repeat(np.arange(n), each)), n), seed=1)
+    guide.learn_particles(ParticleBatch.from_arrays(mi.Vector3f(wo.T), mi.Float(rng.lognormal(0, 2, n * each)),
+                                                    mi.UInt32(np.repeat(np.arange(n), each)), n), seed=1)
+    fraction, outgoing = rng.uniform(0.1, 0.9, n), rng.lognormal(0, 2, n)
+    guide.rows = mi.Float(np.stack([np.ones(n), fraction, outgoing, np.zeros(n)], axis=1).ravel())
+    guide.pixels = PixelEstimate(rng.lognormal(0, 1, guide.pixels.luminance.shape))
 
 
 def test_max_depth(mitsuba_path):

@@ -12,9 +12,9 @@ def test_changes_win_over_the_preset():
     assert training() == TrainingSettings()
 
 
-@pytest.mark.parametrize("preset", ["slow", ["fast"], None])
+@pytest.mark.parametrize("preset", ["slow", ["best"], None])
 def test_unknown_presets(preset):
-    with pytest.raises(InputError, match=r"unknown preset .*; known: fast, paper2014"):
+    with pytest.raises(InputError, match=r"unknown preset .*; known: best, paper2014"):
         training(preset)
 
 

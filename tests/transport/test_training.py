@@ -1,6 +1,8 @@
 """The schedule: what is learnt, in constant memory, without recompiling, and the same each time."""
 from __future__ import annotations
 
+import dataclasses
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,8 +16,10 @@ from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.training import Training, train
 from representations import state as states
 
-SMALL = settings.training(passes=3, photons=20_000, importons=10_000, record_radius=0.08)
+SMALL = settings.training(passes=3, photons=20_000, importons=10_000, record_radius=0.08, camera_passes=2, camera_paths=2 ** 14)
+PARTICLES = dataclasses.replace(SMALL, camera_passes=0)
 DEPTH = 6
+PATHS = settings.integrator(max_depth=DEPTH)
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +34,9 @@ def _arrays(guide: Guide) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("name", representations.names())
 def test_guides_learn_on_line(scene, name):
     seen = []
-    guide = train(scene, name, SMALL, max_depth=DEPTH, on_pass=seen.append)
-    assert [s.index for s in seen] == [0, 1, 2]
+    guide = train(scene, name, SMALL, PATHS, on_pass=seen.append)
+    assert [s.index for s in seen] == [0, 1, 2, 3, 4]
+    assert [s.image is None for s in seen] == [True, True, True, False, False]
     assert all(s.stored > 10_000 and 0 < s.kept <= s.stored for s in seen)
     assert guide.particles == sum(s.kept for s in seen)
     assert guide.records == seen[-1].records > 100
@@ -45,7 +50,7 @@ def test_training_repeats_bit_for_bit_whatever_the_threads(scene, name):
         results = []
         for count in (1, 2):
             dr.set_thread_count(count)
-            results.append(_arrays(train(scene, name, SMALL, max_depth=DEPTH, seed=4)))
+            results.append(_arrays(train(scene, name, SMALL, PATHS, seed=4)))
     finally:
         dr.set_thread_count(threads)
     for key, value in results[0].items():
@@ -53,7 +58,7 @@ def test_training_repeats_bit_for_bit_whatever_the_threads(scene, name):
 
 
 def test_seeds_differ(scene):
-    a, b = (train(scene, "jensen", SMALL, max_depth=DEPTH, seed=s) for s in (0, 1))
+    a, b = (train(scene, "jensen", SMALL, PATHS, seed=s) for s in (0, 1))
     assert a.records != b.records or not np.array_equal(a.cache.points, b.cache.points)
 
 
@@ -63,9 +68,9 @@ def test_no_kernel_is_compiled_after_warm_up(scene, name):
 
     One exception is let pass: in about one run of six with an empty kernel cache, Dr.Jit gave the trace's loop a second form.
     """
-    many = settings.with_changes(SMALL, {"passes": 8})
-    train(scene, name, many, max_depth=DEPTH)
-    passes = Training(scene, name, many, DEPTH, seed=1).run()
+    many = settings.with_changes(SMALL, {"passes": 6, "camera_passes": 5})
+    train(scene, name, many, PATHS)
+    passes = Training(scene, name, many, PATHS, seed=1).run()
     for _ in range(3):
         next(passes)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
@@ -79,7 +84,7 @@ def test_no_kernel_is_compiled_after_warm_up(scene, name):
 
 def test_memory_is_constant(scene):
     """The state is as large after many passes as after two: nothing of the particles stays."""
-    training = Training(scene, "gaussian_mixture", settings.with_changes(SMALL, {"passes": 12}), DEPTH)
+    training = Training(scene, "gaussian_mixture", settings.with_changes(SMALL, {"passes": 6, "camera_passes": 6}), PATHS)
     size = []
     for _ in training.run():
         size.append(states.bytes_of(training.radiance.state) / training.radiance.records)
@@ -89,21 +94,21 @@ def test_memory_is_constant(scene):
 
 def test_single_batch_is_one_unguided_fit(scene):
     seen = []
-    single = settings.with_changes(SMALL, {"schedule": "single_batch"})
-    guide = train(scene, "jensen", single, max_depth=DEPTH, on_pass=seen.append)
+    single = settings.with_changes(PARTICLES, {"schedule": "single_batch"})
+    guide = train(scene, "jensen", single, PATHS, on_pass=seen.append)
     assert len(seen) == 1 and seen[0].photons == 60_000 and seen[0].importons == 0
     assert guide.count.numpy().max() <= SMALL.neighbours
 
 
 def test_no_passes_leave_the_bsdf(scene):
-    guide = train(scene, "gaussian_mixture", settings.with_changes(SMALL, {"passes": 0}), max_depth=DEPTH)
+    guide = train(scene, "gaussian_mixture", settings.with_changes(PARTICLES, {"passes": 0}), PATHS)
     a, b = (mi.render(scene, integrator=olpm_bench.integrator(g, max_depth=DEPTH), spp=8, seed=3) for g in (guide, None))
     assert guide.records == 0
     np.testing.assert_array_equal(a.numpy(), b.numpy())
 
 
 def test_guides_are_saved_and_loaded(scene, tmp_path):
-    guide = train(scene, {"type": "gaussian_mixture", "components": 4}, SMALL, max_depth=DEPTH)
+    guide = train(scene, {"type": "gaussian_mixture", "components": 4}, SMALL, PATHS)
     guide.save(tmp_path / "guide.npz")
     again = Guide.load(tmp_path / "guide.npz")
     assert repr(again) == repr(guide) and again.bytes_per_record == guide.bytes_per_record
@@ -117,7 +122,7 @@ def test_guides_are_saved_and_loaded(scene, tmp_path):
 def test_plugin_trains_once_a_scene(scene):
     olpm_bench.register()
     plugin = mi.load_dict({"type": "guided_path", "representation": "jensen", "passes": 1, "photons": 5_000, "importons": 0,
-                           "record_radius": 0.1, "max_depth": DEPTH})
+                           "record_radius": 0.1, "max_depth": DEPTH, "camera_passes": 0})
     first = mi.render(scene, integrator=plugin, spp=4)
     guide = plugin.guide
     dr.eval(first)
@@ -150,13 +155,13 @@ def test_scenes_that_cannot_be_traced_are_refused(change, message):
     content = box(grey(0.6), lamp=lamp())
     change(content)
     with pytest.raises(ValueError, match=message):
-        train(mi.load_dict(content), "jensen", SMALL, max_depth=DEPTH)
+        train(mi.load_dict(content), "jensen", SMALL, PATHS)
 
 
 def test_particles_that_never_land_leave_the_bsdf():
     """Black walls: nothing is kept, nothing is learnt, and the image is direct light."""
     scene = mi.load_dict(box(grey(0.0), lamp=lamp()))
     for gather in ("binned", "nearest"):
-        guide = train(scene, "gaussian_mixture", settings.with_changes(SMALL, {"gather": gather}), max_depth=DEPTH)
-        assert guide.records == 0 and guide.particles == 0
+        guide = train(scene, "gaussian_mixture", settings.with_changes(SMALL, {"gather": gather}), PATHS)
+        assert guide.trained == 0 and guide.particles == 0
         assert np.isfinite(mi.render(scene, integrator=olpm_bench.integrator(guide, max_depth=DEPTH), spp=4).numpy()).all()

@@ -1,0 +1,138 @@
+"""What a record knows beside its directional distribution: a few running means, the same for every representation.
+
+* the mean weight of the particles of each source, photons (or importons) and camera paths: weights are divided by it, so
+  that the sources, whose units differ, teach one distribution, each particle by its share of its own source;
+* the radiance that its surface returns on the average, next-event estimation left out, for the roulette;
+* the BSDF fraction: the probability with which the directions that bring that radiance were chosen by the BSDF.  As the
+  weight of a mixture of two densities it is learnt by stepwise EM like the others, c' = sum w gamma_bsdf / sum w, which
+  minimises the KL divergence of the mixture from the product f L cos.
+"""
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import cKDTree
+
+from representations.interface import ParticleBatch
+
+MEMORY = 0.7                # of what was learnt about the fraction, kept from one pass to the next: the guide changes
+PRIOR = 20.0                # visits of mean weight that the initial fraction counts for
+FLOOR = 0.1                 # of the fraction and of its complement
+MOST = 20.0                 # heavier estimates from camera paths count as this many times the record's mean weight
+ENOUGH = 30                 # visits; with fewer a record asks its neighbours
+NEIGHBOURS = 8
+
+
+@dataclass
+class Estimates:
+    """Running means of each record; every field [n_records]."""
+    particle_weight: mi.Float       # mean weight of photons or importons
+    particle_count: mi.Float        # and their number
+    camera_weight: mi.Float         # mean weight of estimates from camera paths
+    camera_count: mi.Float
+    visits: mi.Float                # of camera paths
+    returned: mi.Float              # mean luminance that their continuations bring back
+    by_either: mi.Float             # of guided visits, decaying: sum of w, ...
+    by_bsdf: mi.Float               # ... and of w gamma_bsdf
+
+    @staticmethod
+    def nothing(n_records: int) -> Estimates:
+        """Of records that have seen nothing yet."""
+        return Estimates(*(dr.zeros(mi.Float, n_records) for _ in dataclasses.fields(Estimates)))
+
+    def __len__(self) -> int:
+        return len(self.visits)
+
+    def normalise_particles(self, batch: ParticleBatch) -> ParticleBatch:
+        """The batch with weights relative to the mean of the record's photons (importons) so far, these included."""
+        self.particle_weight, self.particle_count = _advance(self.particle_weight, self.particle_count, batch)
+        return _relative(batch, self.particle_weight, dr.inf)
+
+    def normalise_camera(self, batch: ParticleBatch) -> ParticleBatch:
+        """The same for estimates from camera paths, which are cut at `MOST` times the mean: their tails are heavy."""
+        self.camera_weight, self.camera_count = _advance(self.camera_weight, self.camera_count, batch)
+        return _relative(batch, self.camera_weight, MOST)
+
+    def learn(self, returned: mi.Float, chosen_by_bsdf: mi.Float, offset: mi.UInt32) -> None:
+        """From visits of camera paths grouped by record: luminance returned, probability of the BSDF (-1: unguided)."""
+        record = dr.arange(mi.UInt32, len(self))
+        n = mi.Float(dr.gather(mi.UInt32, offset, record + 1) - dr.gather(mi.UInt32, offset, record))
+        total, = sums([returned], offset)
+        self.visits = self.visits + n
+        self.returned = _mean(self.returned, total, n, self.visits)
+        dr.eval(self.visits, self.returned)
+        most = MOST * self.returned
+        either, bsdf = sums([returned, chosen_by_bsdf], offset, most)
+        self.by_either, self.by_bsdf = MEMORY * self.by_either + either, MEMORY * self.by_bsdf + bsdf
+        dr.eval(self.by_either, self.by_bsdf)
+
+    def fraction(self, initial: float) -> mi.Float:
+        """The learnt BSDF fraction of each record."""
+        prior = PRIOR * dr.maximum(self.returned, 1e-30)
+        return dr.clip((self.by_bsdf + initial * prior) / (self.by_either + prior), FLOOR, 1 - FLOOR)
+
+    def outgoing(self, points: np.ndarray) -> mi.Float:
+        """The radiance that each record returns; -1 where neither it nor its neighbours know.
+
+        Args:
+            points: positions of the records (n, 3).
+        """
+        visits, returned = self.visits.numpy().astype(float), self.returned.numpy().astype(float)
+        few = np.flatnonzero(visits < ENOUGH)
+        result = np.where(visits > 0, returned, -1.0)
+        if len(few) and len(points) >= NEIGHBOURS:
+            near = cKDTree(points).query(points[few], k=NEIGHBOURS, workers=dr.thread_count())[1]
+            n = visits[near].sum(1)
+            result[few] = np.where(n >= ENOUGH, (visits[near] * returned[near]).sum(1) / np.maximum(n, 1), -1)
+        return mi.Float(result.astype(np.float32))
+
+
+def _advance(mean: mi.Float, count: mi.Float, batch: ParticleBatch) -> tuple[mi.Float, mi.Float]:
+    """Running mean and count of a batch's weights."""
+    total, = sums([batch.weight], batch.offset)
+    n = mi.Float(batch.count())
+    count = count + n
+    mean = _mean(mean, total, n, count)
+    dr.eval(mean, count)
+    return mean, count
+
+
+def _relative(batch: ParticleBatch, mean: mi.Float, most: float) -> ParticleBatch:
+    """The batch with weights in units of the record's `mean`, at most `most`."""
+    scale = dr.gather(mi.Float, dr.select(mean > 0, dr.rcp(mean), 0), batch.record)
+    return dataclasses.replace(batch, weight=dr.minimum(batch.weight * scale, most))
+
+
+def _mean(mean: mi.Float, total: mi.Float, n: mi.Float, all_n: mi.Float) -> mi.Float:
+    """A running mean after `n` more values of sum `total`, which make `all_n`."""
+    return mean + (total - n * mean) / dr.maximum(all_n, 1)
+
+
+@dr.syntax
+def sums(values: Sequence[mi.Float], offset: mi.UInt32, most: mi.Float | None = None) -> list[mi.Float]:
+    """Sums over the entries of each record, in their order; a lane a record.
+
+    Args:
+        values: one array, or (with `most`) weights and a second array that is multiplied with them; entries whose second is
+            negative are left out, and weights are cut at `most`.
+    """
+    record = dr.arange(mi.UInt32, len(offset) - 1)
+    i, end = dr.gather(mi.UInt32, offset, record), dr.gather(mi.UInt32, offset, record + 1)
+    first, second = mi.Float(0), mi.Float(0)
+    if dr.hint(most is None, mode="scalar"):
+        while i < end:
+            first += dr.gather(mi.Float, values[0], i)
+            i += 1
+    else:
+        while i < end:
+            w, gamma = dr.minimum(dr.gather(mi.Float, values[0], i), most), dr.gather(mi.Float, values[1], i)
+            first += dr.select(gamma >= 0, w, 0)
+            second += dr.select(gamma >= 0, w * gamma, 0)
+            i += 1
+    dr.eval(first, second)
+    return [first] if most is None else [first, second]

@@ -1,0 +1,49 @@
+"""Roulette by expected contribution: how likely a camera path is to be worth its pixel's while.
+
+At a vertex with throughput beta, on a record that returns the radiance L_o on the average, a path can be expected to bring
+beta L_o to a pixel that is worth I.  It goes on with probability  q = min(beta L_o / (I window), 1)  (adjoint-driven
+Russian roulette, Vorba & Křivánek 2016, without its splitting), at least `LEAST` so that a wrong estimate costs little.  Any
+estimates leave the image unbiased: survivors are divided by q.
+"""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import gaussian_filter, median_filter
+
+LEAST = 0.05            # survival probability
+DARKEST = 0.02          # of a pixel, relative to the image's mean: black ones would keep every path
+SIGMA = 1.0             # of the filter [pixels]
+
+
+class PixelEstimate:
+    """A smooth estimate of the luminance of each pixel.
+
+    Args:
+        luminance: noisy image (h, w); an outlier is removed by a median over 3 x 3 pixels.
+    """
+
+    def __init__(self, luminance: np.ndarray) -> None:
+        self.luminance = np.asarray(luminance, np.float32)
+        smooth = gaussian_filter(median_filter(self.luminance, 3), SIGMA)
+        smooth = np.maximum(smooth, DARKEST * max(float(smooth.mean()), 1e-30))
+        self.height, self.width = smooth.shape
+        self.values = mi.Float(np.ascontiguousarray(smooth.ravel()))
+        dr.make_opaque(self.values)
+        self.size = dr.opaque(mi.UInt32, self.width), dr.opaque(mi.UInt32, self.height)
+
+    def at(self, position: mi.Point2f) -> mi.Float:
+        """Luminance at positions on the film in [0, 1]^2."""
+        x, y = (dr.minimum(mi.UInt32(dr.maximum(p, 0) * s), s - 1) for p, s in zip(position, self.size, strict=True))
+        return dr.gather(mi.Float, self.values, y * self.size[0] + x)
+
+
+def by_throughput(beta: mi.Spectrum, eta: mi.Float, deep: mi.Bool) -> mi.Float:
+    """Survival probability after scattering, as in Mitsuba's `path`: `eta` cancels the square that refraction multiplies with."""
+    return dr.select(deep, dr.minimum(dr.max(beta) * dr.square(eta), 0.95), 1)
+
+
+def by_contribution(beta: mi.Spectrum, outgoing: mi.Float, worth: mi.Float) -> mi.Float:
+    """Survival probability before scattering: expected contribution over what is `worth` a path; see above."""
+    return dr.clip(mi.luminance(beta) * outgoing / worth, LEAST, 1)

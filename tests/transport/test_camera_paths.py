@@ -1,0 +1,77 @@
+"""What is learnt from camera paths: a transcript in NumPy, the rendering equation at diffuse surfaces, and memory."""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_scenes import box, grey, lamp
+
+import olpm_bench
+from olpm_bench.transport import camera_paths
+from olpm_bench.transport.camera_paths import CameraPaths
+
+ALBEDO, DEPTH, SPP = 0.6, 6, 16
+POINT = {"type": "point", "position": [0.3, 0.4, 0.3], "intensity": 1.0}        # which no path can hit
+
+
+def _render(content, **settings) -> tuple[mi.TensorXf, CameraPaths]:
+    scene = mi.load_dict(content, optimize=False)
+    sensor = scene.sensors()[0]
+    paths = CameraPaths(int(np.prod(sensor.film().crop_size())), SPP, DEPTH)
+    image = olpm_bench.integrator(max_depth=DEPTH, **settings).render_paths(scene, sensor, 3, SPP, paths)
+    dr.eval(image)
+    paths.propagate()
+    return image, paths
+
+
+def _vertices(paths: CameraPaths) -> dict[str, np.ndarray]:
+    """[rows, n_paths, 4] of each array; NaN in rows that a path has not reached."""
+    unused = np.arange(paths.rows)[:, None] >= paths.count.numpy()
+    found = {}
+    for name in ("position", "direction", "normal", "weight", "reflected", "emitted"):
+        found[name] = getattr(paths, name).numpy().reshape(paths.rows, paths.n_paths, 4).astype(float)
+        found[name][unused] = np.nan
+    return found
+
+
+@pytest.mark.parametrize("roulette", ["none", "throughput"])
+def test_radiance_is_propagated_from_the_end_of_each_path(roulette):
+    """The recursion in NumPy; and what arrives at the camera is the image."""
+    image, paths = _render(box(grey(ALBEDO), light=POINT), roulette=roulette, rr_depth=2)
+    v = {name: np.nan_to_num(array) for name, array in _vertices(paths).items()}
+    radiance = np.zeros((paths.n_paths, 3))
+    luminance = np.array(mi.luminance(mi.Color3f(np.eye(3, dtype=np.float32))))
+    for row in reversed(range(paths.rows)):
+        incident = v["emitted"][row, :, :3] + radiance
+        returned = v["weight"][row, :, :3] * incident
+        np.testing.assert_allclose(v["position"][row, :, 3], incident @ luminance * v["weight"][row, :, 3], rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(v["reflected"][row, :, 3], returned @ luminance, rtol=1e-4, atol=1e-7)
+        radiance = v["reflected"][row, :, :3] + returned
+    assert radiance.mean() == pytest.approx(image.numpy()[..., :3].mean(), rel=1e-4)
+    assert (paths.count.numpy() < paths.rows).any() == (roulette == "throughput")
+
+
+def test_diffuse_surfaces_return_what_arrives():
+    """L_o = (a / pi) E: what a vertex returns is a / pi times the weight of its estimate of incident flux."""
+    _, paths = _render(box(grey(ALBEDO), light=POINT), roulette="none")
+    particles = paths.particles()
+    _, weight, direction, distance, normal = particles.read(particles.place)
+    returned, chosen_by_bsdf = paths.returned(particles.place)
+    np.testing.assert_allclose(returned.numpy(), ALBEDO / np.pi * weight.numpy(), rtol=1e-3, atol=1e-6)
+    assert len(particles) > 5_000 and weight.numpy().max() > 0
+    assert (chosen_by_bsdf.numpy() == -1).all()                 # nobody guided
+    seen = weight.numpy() > 0
+    assert (dr.dot(direction, normal).numpy()[seen] > 0).all() and (distance.numpy()[seen] > 0).all()
+
+
+def test_vertices_are_bounded_and_evenly_spaced(monkeypatch):
+    """Of more paths than are kept, whole pixels are left out in even spacing."""
+    monkeypatch.setattr(camera_paths, "MOST_PATHS", 1000)
+    _, paths = _render(box(grey(ALBEDO), lamp=lamp()), roulette="none")
+    pixels = paths.n_paths // SPP
+    assert paths.n_paths <= 1000 + SPP and pixels > 30
+    assert len(paths.position) == 4 * paths.rows * paths.n_paths
+    assert (paths.count.numpy() == paths.rows).mean() > 0.9
+    first = _vertices(paths)["position"][0, :pixels, :3]
+    assert np.isfinite(first).all() and len(np.unique(first, axis=0)) == pixels
