@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -26,6 +25,7 @@ FLOOR = 0.1                 # of the fraction and of its complement
 MOST = 20.0                 # heavier estimates from camera paths count as this many times the record's mean weight
 ENOUGH = 30                 # visits; with fewer a record asks its neighbours
 NEIGHBOURS = 8
+MOST_VISITS = 1024          # of a pass that count: a lane sums them one by one
 
 
 @dataclass
@@ -60,14 +60,11 @@ class Estimates:
 
     def learn(self, returned: mi.Float, chosen_by_bsdf: mi.Float, offset: mi.UInt32) -> None:
         """From visits of camera paths grouped by record: luminance returned, probability of the BSDF (-1: unguided)."""
-        record = dr.arange(mi.UInt32, len(self))
-        n = mi.Float(dr.gather(mi.UInt32, offset, record + 1) - dr.gather(mi.UInt32, offset, record))
-        total, = sums([returned], offset)
+        n, total = _visit_sums(returned, offset)
         self.visits = self.visits + n
         self.returned = _mean(self.returned, total, n, self.visits)
         dr.eval(self.visits, self.returned)
-        most = MOST * self.returned
-        either, bsdf = sums([returned, chosen_by_bsdf], offset, most)
+        either, bsdf = _fraction_sums(returned, chosen_by_bsdf, offset, MOST * self.returned)
         self.by_either, self.by_bsdf = MEMORY * self.by_either + either, MEMORY * self.by_bsdf + bsdf
         dr.eval(self.by_either, self.by_bsdf)
 
@@ -79,23 +76,24 @@ class Estimates:
     def outgoing(self, points: np.ndarray) -> mi.Float:
         """The radiance that each record returns; -1 where neither it nor its neighbours know.
 
+        Who has only seen darkness does not know either: to end paths for that would keep the light from being found.
+
         Args:
             points: positions of the records (n, 3).
         """
         visits, returned = self.visits.numpy().astype(float), self.returned.numpy().astype(float)
         few = np.flatnonzero(visits < ENOUGH)
-        result = np.where(visits > 0, returned, -1.0)
+        result = np.where(returned > 0, returned, -1.0)
         if len(few) and len(points) >= NEIGHBOURS:
             near = cKDTree(points).query(points[few], k=NEIGHBOURS, workers=dr.thread_count())[1]
-            n = visits[near].sum(1)
-            result[few] = np.where(n >= ENOUGH, (visits[near] * returned[near]).sum(1) / np.maximum(n, 1), -1)
+            n, total = visits[near].sum(1), (visits[near] * returned[near]).sum(1)
+            result[few] = np.where((n >= ENOUGH) & (total > 0), total / np.maximum(n, 1), -1)
         return mi.Float(result.astype(np.float32))
 
 
 def _advance(mean: mi.Float, count: mi.Float, batch: ParticleBatch) -> tuple[mi.Float, mi.Float]:
     """Running mean and count of a batch's weights."""
-    total, = sums([batch.weight], batch.offset)
-    n = mi.Float(batch.count())
+    n, total = _visit_sums(batch.weight, batch.offset)
     count = count + n
     mean = _mean(mean, total, n, count)
     dr.eval(mean, count)
@@ -113,26 +111,36 @@ def _mean(mean: mi.Float, total: mi.Float, n: mi.Float, all_n: mi.Float) -> mi.F
     return mean + (total - n * mean) / dr.maximum(all_n, 1)
 
 
-@dr.syntax
-def sums(values: Sequence[mi.Float], offset: mi.UInt32, most: mi.Float | None = None) -> list[mi.Float]:
-    """Sums over the entries of each record, in their order; a lane a record.
-
-    Args:
-        values: one array, or (with `most`) weights and a second array that is multiplied with them; entries whose second is
-            negative are left out, and weights are cut at `most`.
-    """
+def _visits(offset: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    """First entry, end and stride of each record, so that at most `MOST_VISITS` are visited in even spacing."""
     record = dr.arange(mi.UInt32, len(offset) - 1)
-    i, end = dr.gather(mi.UInt32, offset, record), dr.gather(mi.UInt32, offset, record + 1)
-    first, second = mi.Float(0), mi.Float(0)
-    if dr.hint(most is None, mode="scalar"):
-        while i < end:
-            first += dr.gather(mi.Float, values[0], i)
-            i += 1
-    else:
-        while i < end:
-            w, gamma = dr.minimum(dr.gather(mi.Float, values[0], i), most), dr.gather(mi.Float, values[1], i)
-            first += dr.select(gamma >= 0, w, 0)
-            second += dr.select(gamma >= 0, w * gamma, 0)
-            i += 1
-    dr.eval(first, second)
-    return [first] if most is None else [first, second]
+    begin, end = dr.gather(mi.UInt32, offset, record), dr.gather(mi.UInt32, offset, record + 1)
+    return begin, end, dr.maximum((end - begin + MOST_VISITS - 1) // MOST_VISITS, 1)
+
+
+@dr.syntax
+def _visit_sums(values: mi.Float, offset: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Number and sum of the visited entries of each record, in their order; a lane a record."""
+    i, end, stride = _visits(offset)
+    n, total = mi.Float(0), mi.Float(0)
+    while i < end:
+        total += dr.gather(mi.Float, values, i)
+        n += 1
+        i += stride
+    dr.eval(n, total)
+    return n, total
+
+
+@dr.syntax
+def _fraction_sums(weight: mi.Float, gamma: mi.Float, offset: mi.UInt32, most: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Of the visited entries with gamma >= 0, sums of the weights, cut at `most`, and of weight times gamma."""
+    i, end, stride = _visits(offset)
+    either, bsdf = mi.Float(0), mi.Float(0)
+    while i < end:
+        g = dr.gather(mi.Float, gamma, i)
+        w = dr.select(g >= 0, dr.minimum(dr.gather(mi.Float, weight, i), most), 0)
+        either += w
+        bsdf += w * g
+        i += stride
+    dr.eval(either, bsdf)
+    return either, bsdf

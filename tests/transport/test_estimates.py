@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from olpm_bench.transport import estimates
-from olpm_bench.transport.estimates import Estimates, sums
+from olpm_bench.transport.estimates import Estimates
 from representations.interface import ParticleBatch
 
 N = 40
@@ -21,14 +21,22 @@ def _batch(rng: np.random.Generator, scale: float, n: int = 2_000) -> ParticleBa
 def test_sums_by_record():
     batch = _batch(np.random.default_rng(0), 1)
     record, weight = batch.record.numpy(), batch.weight.numpy()
-    total, = sums([batch.weight], batch.offset)
+    n, total = estimates._visit_sums(batch.weight, batch.offset)
+    np.testing.assert_array_equal(n.numpy(), np.bincount(record, minlength=N))
     np.testing.assert_allclose(total.numpy(), np.bincount(record, weight, N), rtol=1e-5)
     gamma = np.where(np.arange(len(weight)) % 3 == 0, -1, 0.25).astype(np.float32)
     most = mi.Float(np.full(N, 2, np.float32))
-    either, bsdf = sums([batch.weight, mi.Float(gamma)], batch.offset, most)
+    either, bsdf = estimates._fraction_sums(batch.weight, mi.Float(gamma), batch.offset, most)
     guided = np.where(gamma >= 0, np.minimum(weight, 2), 0)
     np.testing.assert_allclose(either.numpy(), np.bincount(record, guided, N), rtol=1e-5)
     np.testing.assert_allclose(bsdf.numpy(), np.bincount(record, 0.25 * guided, N), rtol=1e-5)
+
+
+def test_of_many_visits_some_in_even_spacing_count():
+    n = 3 * estimates.MOST_VISITS + 5
+    count, total = estimates._visit_sums(mi.Float(np.arange(n)), mi.UInt32(0, n))
+    assert estimates.MOST_VISITS / 2 < count[0] <= estimates.MOST_VISITS
+    assert total[0] / count[0] == pytest.approx(n / 2, rel=0.01)
 
 
 def test_sources_teach_in_units_of_their_own_mean():
