@@ -69,6 +69,11 @@ class GuidedBSDF:
         bs, weight = self.bsdf.sample(ctx, self.si, sample1, sample2, active & choose_bsdf)
         return self._one_sample(ctx, choose_bsdf, bs, weight, sample1, sample2, active)
 
+    def eval_pdf(self, ctx: mi.BSDFContext, wo: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+        """Value f cos and density of one direction, as `mi.BSDF.eval_pdf`."""
+        value, pdf = self.bsdf.eval_pdf(ctx, self.si, wo, active)
+        return value, pdf if self.guided is None else self._mixture_pdf(pdf, wo)
+
     def _choose(self, sample1: mi.Float) -> tuple[mi.Bool, mi.Float]:
         """Spend one uniform number on the choice of technique, and make it uniform again for the technique."""
         choose_bsdf = sample1 < self.fraction

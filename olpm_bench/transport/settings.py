@@ -79,6 +79,9 @@ class TrainingSettings:
     record_radius: validity radius of a record, in units of the scene's diagonal [L: 0.01].
     fraction: probability of sampling the BSDF rather than the guide when particles scatter.
     learn_fraction: learn it from camera paths, record by record, for camera paths and importons.
+    emission: "guided" starts photons of lights at infinity (constant, envmap, sunsky, directional) where importons leave for
+        them; "emitter" by the emitters' own samplers.
+    emission_fraction: probability of the emitter's own sampler in guided emission, its defensive share [T 113-117].
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
     schedule: Literal["interleaved", "single_batch"] = "interleaved"
@@ -95,6 +98,8 @@ class TrainingSettings:
     record_radius: float = 0.02
     fraction: float = 0.5
     learn_fraction: bool = True
+    emission: Literal["guided", "emitter"] = "guided"
+    emission_fraction: float = 0.2
 
     def __post_init__(self) -> None:
         _require_types(self)
@@ -107,6 +112,8 @@ class TrainingSettings:
         _require(0 < self.share <= 1, "share", self.share, "in (0, 1]")
         _require(0 < self.record_radius <= 0.25, "record_radius", self.record_radius, "in (0, 0.25] of the scene's diagonal")
         _require(0 < self.fraction <= 1, "fraction", self.fraction, "in (0, 1]")
+        _require(self.emission in ("guided", "emitter"), "emission", self.emission, "'guided' or 'emitter'")
+        _require(0 < self.emission_fraction <= 1, "emission_fraction", self.emission_fraction, "in (0, 1]")
 
 
 def _require_choice(settings: Any, name: str, *choices: str) -> None:

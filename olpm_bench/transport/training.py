@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -23,6 +24,7 @@ import numpy as np
 
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.camera_paths import CameraPaths
+from olpm_bench.transport.emission import EmissionGuide, distant_lights
 from olpm_bench.transport.gather import GATHERS, binned, by_record
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
@@ -134,6 +136,8 @@ class Training:
         self.integrator = GuidedPathIntegrator(integrator, self.radiance)
         self.luminance: np.ndarray | None = None        # of the mean of all camera passes so far (h, w), ...
         self.spp = 0                                    # ... and their samples a pixel
+        self.emission = EmissionGuide(scene, bounds, settings.emission_fraction) if (
+            settings.emission == "guided" and settings.schedule == "interleaved" and distant_lights(scene)) else None
         self.sensor = sensor or scene.sensors()[0]
         self.sampler = mi.load_dict({"type": "independent"})
         self.draws = 0                      # seeds used so far
@@ -159,9 +163,12 @@ class Training:
         """Importons, then photons, each guided by what the other has learnt so far."""
         s = self.settings
         if s.importons:
-            importons = self._trace(emit_importons, self.sensor, s.importons, self.radiance, mi.TransportMode.Radiance,
+            importons = self._trace(partial(emit_importons, self.sensor), s.importons, self.radiance, mi.TransportMode.Radiance,
                                     statistics)
             self._learn(self.importance, importons, statistics)
+            if self.emission is not None and importons.departures is not None:
+                with _Seconds(statistics, "update"):
+                    self.emission.learn(importons.departures, self._next_seed())
             statistics.importons = s.importons
         return self._photons(s.photons, self.importance, statistics)
 
@@ -170,18 +177,20 @@ class Training:
         return self._photons(self.settings.photons * self.settings.passes, None, statistics)
 
     def _photons(self, n: int, importance: Guide | None, statistics: PassStatistics) -> PassStatistics:
-        photons = self._trace(emit_photons, self.scene, n, importance, mi.TransportMode.Importance, statistics)
+        emit = self.emission.emit if self.emission is not None else partial(emit_photons, self.scene)
+        photons = self._trace(emit, n, importance, mi.TransportMode.Importance, statistics)
         statistics.kept = self._learn(self.radiance, photons, statistics)
         statistics.photons, statistics.stored = n, len(photons)
         statistics.records = self.radiance.records
         return statistics
 
-    def _trace(self, emit: Callable[[Any, mi.Sampler], ParticleRays], source: mi.Scene | mi.Sensor, n: int, guide: Guide | None,
-               mode: mi.TransportMode, statistics: PassStatistics) -> Particles:
+    def _trace(self, emit: Callable[[mi.Sampler], ParticleRays], n: int, guide: Guide | None, mode: mi.TransportMode,
+               statistics: PassStatistics) -> Particles:
         with _Seconds(statistics, "trace"):
             self.sampler.seed(dr.opaque(mi.UInt32, self._next_seed()), n)
-            rays = emit(source, self.sampler)
-            return trace(self.scene, rays, self.sampler, guide, self.settings.fraction, self.max_depth, mode)
+            rays = emit(self.sampler)
+            emission = self.emission if mode == mi.TransportMode.Radiance else None
+            return trace(self.scene, rays, self.sampler, guide, self.settings.fraction, self.max_depth, mode, emission)
 
     def _learn(self, guide: Guide, particles: Particles, statistics: PassStatistics) -> int:
         if len(particles) == 0:             # nothing of this pass has reached a second surface

@@ -28,6 +28,8 @@ def test_unknown_presets(preset):
     ({"fraction": float("nan")}, r"fraction = nan: must be in \(0, 1\]"),
     ({"gather": ["binned"]}, r"gather = \['binned'\]: must be a string"),
     ({"gather": "near"}, "gather = 'near': must be 'binned' or 'nearest'"),
+    ({"emission": "guide"}, "emission = 'guide': must be 'guided' or 'emitter'"),
+    ({"emission_fraction": 0.0}, r"emission_fraction = 0\.0: must be in \(0, 1\]"),
 ])
 def test_wrong_values(changes, message):
     with pytest.raises(InputError, match=message):
