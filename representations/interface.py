@@ -48,6 +48,17 @@ class ParticleBatch:
         record = dr.arange(mi.UInt32, self.n_records)
         return dr.gather(mi.UInt32, self.offset, record + 1) - dr.gather(mi.UInt32, self.offset, record)
 
+    @dr.syntax
+    def sums(self) -> mi.Float:
+        """Sum of the weights of each record's particles, in their order [n_records]."""
+        record = dr.arange(mi.UInt32, self.n_records)
+        i, end = dr.gather(mi.UInt32, self.offset, record), dr.gather(mi.UInt32, self.offset, record + 1)
+        total = dr.zeros(mi.Float, self.n_records)
+        while i < end:
+            total += dr.gather(mi.Float, self.weight, i)
+            i += 1
+        return total
+
     @staticmethod
     def empty(n_records: int) -> ParticleBatch:
         """No particles at all."""

@@ -84,6 +84,12 @@ def slit(gap: float = 0.07, rotation: float = 23.7) -> np.ndarray:
     return points @ turn_z(rotation).T
 
 
+def room(p: np.ndarray, rotation: float = 23.7) -> np.ndarray:
+    """0 for points [n, 3] in the dark room, with the camera; 1 for those in the corridor: the wall's middle parts them."""
+    from olpm_bench.scenes.geometry import turn_z
+    return ((p @ turn_z(rotation))[:, 1] > (DEPTH + LIT) / 2).astype(int)
+
+
 def check(gap: float, rotation: float, floor_roughness: float) -> None:
     """
     Raises:

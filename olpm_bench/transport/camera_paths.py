@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
-from olpm_bench.transport.particles import UNBOUNDED_DEPTH, Particles
+from olpm_bench.transport.particles import UNBOUNDED_DEPTH, Particles, places
 
 MOST_PATHS = 2 ** 18        # kept of a pass; a vertex takes 96 bytes
 
@@ -103,10 +103,7 @@ class CameraPaths:
 
     def particles(self) -> Particles:
         """All vertices, path by path, as particles that carry the radiance that arrived (`propagate` comes first)."""
-        hit = dr.arange(mi.UInt32, self.rows * self.n_paths)
-        path, row = hit // self.rows, hit % self.rows
-        used = dr.compress(row < dr.gather(mi.UInt32, self.count, path))
-        return Particles(self.position, self.direction, self.normal, dr.gather(mi.UInt32, row * self.n + path, used))
+        return Particles(self.position, self.direction, self.normal, places(self.count, self.rows), self.n_paths)
 
     def returned(self, place: mi.UInt32) -> tuple[mi.Float, mi.Float]:
         """Luminance returned by the continuation of vertices, and the probability that the BSDF chose it, or -1."""

@@ -2,6 +2,7 @@
 
 * the mean weight of the particles of each source, photons (or importons) and camera paths: weights are divided by it, so
   that the sources, whose units differ, teach one distribution, each particle by its share of its own source;
+* the fluence of its photons (importons): their weight per emitted particle and area, for the window of particles;
 * the radiance that its surface returns on the average, next-event estimation left out, for the roulette;
 * the BSDF fraction: the probability with which the directions that bring that radiance were chosen by the BSDF.  As the
   weight of a mixture of two densities it is learnt by stepwise EM like the others, c' = sum w gamma_bsdf / sum w, which
@@ -33,6 +34,8 @@ class Estimates:
     """Running means of each record; every field [n_records]."""
     particle_weight: mi.Float       # mean weight of photons or importons
     particle_count: mi.Float        # and their number
+    fluence: mi.Float               # of photons or importons, mean over passes [per emitted particle and area]
+    passes: mi.Float                # and their number
     camera_weight: mi.Float         # mean weight of estimates from camera paths
     camera_count: mi.Float
     visits: mi.Float                # of camera paths
@@ -47,6 +50,12 @@ class Estimates:
 
     def __len__(self) -> int:
         return len(self.visits)
+
+    def learn_fluence(self, batch: ParticleBatch, norm: mi.Float) -> None:
+        """From the particles of one pass; `norm` is the area of each record times the particles emitted."""
+        self.passes = self.passes + 1
+        self.fluence = dr.lerp(self.fluence, batch.sums() / norm, dr.rcp(self.passes))
+        dr.eval(self.passes, self.fluence)
 
     def normalise_particles(self, batch: ParticleBatch) -> ParticleBatch:
         """The batch with weights relative to the mean of the record's photons (importons) so far, these included."""

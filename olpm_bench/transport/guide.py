@@ -26,13 +26,14 @@ class GuidedPoint:
     """The distribution that serves a surface point, in world space.
 
     Attributes:
+        found: there is a record.
         valid: there is a record, and it has seen enough particles.
         fraction: its learnt BSDF fraction; 0: not learnt.
         outgoing: the mean radiance that it returns; -1: not known.
     """
 
     def __init__(self, guide: Guide, record: mi.UInt32, frame: mi.Frame3f, found: mi.Bool) -> None:
-        self.guide, self.record, self.frame = guide, record, frame
+        self.guide, self.record, self.frame, self.found = guide, record, frame, found
         row = dr.gather(mi.Vector4f, guide.rows, record, found)
         self.valid, self.fraction, self.outgoing = row.x > 0, row.y, dr.select(found, row.z, -1)
 
@@ -96,9 +97,10 @@ class Guide:
             dr.eval(self.state, self.count, self.estimates)
             self._tabulate()
 
-    def learn_particles(self, batch: ParticleBatch, seed: int) -> None:
-        """One on-line update with the photons or importons of one pass."""
+    def learn_particles(self, batch: ParticleBatch, seed: int, emitted: int = 1) -> None:
+        """One on-line update with the photons or importons of one pass, of which so many were `emitted`."""
         if len(batch):
+            self.estimates.learn_fluence(batch, self.areas() * dr.opaque(mi.Float, emitted))
             self._update(self.estimates.normalise_particles(batch), seed)
 
     def learn_camera(self, batch: ParticleBatch, seed: int) -> None:
@@ -124,6 +126,15 @@ class Guide:
         outgoing = self.estimates.outgoing(self.cache.points[:, :3])
         self.rows = dr.ravel(mi.Vector4f(dr.select(self.count >= MIN_PARTICLES, mi.Float(1), 0), c, outgoing, 0))
         dr.eval(self.rows)
+
+    def fluence_at(self, p: mi.Point3f, n: mi.Normal3f) -> mi.Float:
+        """Fluence [per emitted particle and area] at the record that serves a point; 0 where there is none."""
+        record, _, found = self.cache.lookup(p, n, True)
+        return dr.gather(mi.Float, self.estimates.fluence, record, found)
+
+    def areas(self) -> mi.Float:
+        """Area from which each record takes its particles, up to a factor [scene units^2]."""
+        return dr.opaque(mi.Float, self.cache.radius ** 2)
 
     # ---------------------- Files ----------------------
 

@@ -9,24 +9,28 @@ camera sees belong to next-event estimation [L].
 """
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
 from olpm_bench.transport.settings import InputError
+from olpm_bench.transport.window import HEAVIEST, HIGH, LEAST_SURVIVAL, LIGHTEST, LOW, Window
 
 if TYPE_CHECKING:
     from olpm_bench.transport.emission import EmissionGuide
 
-# The weight window [L], relative to the total flux of the emitters, or to 1 for importons.  Its lower end leaves nearly
-# all particles alone: roulette on throughput kills exactly the guided ones, which carry little for a reason.
-LIGHTEST, HEAVIEST = 1e-6, 2 + 1e-6
+MOST_COPIES = 32                # of a particle that splits
+LEVELS = 3                      # particles in waiting, each with its copies, before there is no more splitting
+LANES = 1 << 13                 # particles traced side by side; a lane takes up the next when one has ended
 UNBOUNDED_DEPTH = 32            # particle paths end here when camera paths have no limit
-DEPARTURES = 8                  # kept of an importon's path: its first ones; only proposals are learnt from them
+DEPARTURES = 8                  # kept of an importon's path on average: its first ones; only proposals are learnt from them
 
 
 @dataclass
@@ -51,15 +55,16 @@ class Departures:
 
 @dataclass
 class Particles:
-    """Hits of particles; `place` lists those in use, path by path.
+    """Hits of particles; `place` lists those in use, lane by lane and path by path.
 
-    Every hit of a path has a place of its own, ``row * n_paths + path``, so the order does not depend on threads.  And
+    Every hit has a place of its own, ``row * lanes + lane``, so the order does not depend on threads.  And
     not on the depth either: on-line learning remembers the last particles best, so they must not be the deepest.
     """
-    position: mi.Float      # [rows * n_paths * 4] position and weight
-    direction: mi.Float     # [rows * n_paths * 4] direction the particle came from, and length of its last segment
-    normal: mi.Float        # [rows * n_paths * 4] geometric normal on the incident side, unused
+    position: mi.Float      # [rows * lanes * 4] position and weight
+    direction: mi.Float     # [rows * lanes * 4] direction the particle came from, and length of its last segment
+    normal: mi.Float        # [rows * lanes * 4] geometric normal on the incident side, unused
     place: mi.UInt32        # [hits]
+    lanes: int
     departures: Departures | None = None
 
     def __len__(self) -> int:
@@ -69,6 +74,18 @@ class Particles:
         """Position, weight, direction, distance and normal of hits."""
         p, d, n = (dr.gather(mi.Vector4f, a, place) for a in (self.position, self.direction, self.normal))
         return mi.Point3f(p.x, p.y, p.z), p.w, mi.Vector3f(d.x, d.y, d.z), d.w, mi.Normal3f(n.x, n.y, n.z)
+
+
+    def by_region(self, region: Callable[[np.ndarray], np.ndarray], n: int) -> np.ndarray:
+        """Hits in each of n regions, and their effective number (sum w)^2 / sum w^2 [n, 2].
+
+        Args:
+            region: of positions [hits, 3], their indices.
+        """
+        p, weight, _, _, _ = self.read(self.place)
+        index, w = region(np.stack([x.numpy() for x in p], 1)), weight.numpy().astype(float)
+        count, total, squares = (np.bincount(index, x, n) for x in (np.ones(len(w)), w, w * w))
+        return np.stack([count, total ** 2 / np.maximum(squares, np.finfo(float).tiny)], 1)
 
 
 def emit_photons(scene: mi.Scene, sampler: mi.Sampler) -> ParticleRays:
@@ -103,20 +120,51 @@ def evaluated(ray: mi.Ray3f, weight: mi.Spectrum) -> ParticleRays:
     return rays
 
 
+@dataclass
+class _Waiting:
+    """Copies of a particle that was split: the segment that leads to the vertex where it was, and their share there."""
+    o: mi.Point3f
+    d: mi.Vector3f
+    weight: mi.Spectrum
+    depth: mi.UInt32        # vertices met before that vertex
+    copies: mi.UInt32       # 0: nothing is waiting here
+
+
+def _push(waiting: list[_Waiting], top: _Waiting, active: mi.Bool) -> list[_Waiting]:
+    """The stack with `top` on it; its lowest level must be free."""
+    return [dr.select(active, above, here) for above, here in zip([top, *waiting], waiting, strict=False)]
+
+
+def _pop(waiting: list[_Waiting], active: mi.Bool) -> tuple[_Waiting, list[_Waiting]]:
+    """One copy of what is on top, and the stack without it.
+
+    Registers that move up and down: Dr.Jit 1.5.0's local memory overwrites other data.
+    """
+    top = waiting[0]
+    others = [dataclasses.replace(top, copies=top.copies - 1), *waiting[1:]]
+    emptied = active & (top.copies == 1)
+    below = [*waiting[1:], dr.zeros(_Waiting)]
+    return top, [dr.select(emptied, b, dr.select(active, o, w)) for b, o, w in zip(below, others, waiting, strict=True)]
+
+
 @dr.syntax
 def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide | None, fraction: float, max_depth: int,
-          mode: mi.TransportMode, emission: EmissionGuide | None = None) -> Particles:
+          mode: mi.TransportMode, window: Window | None = None, emission: EmissionGuide | None = None) -> Particles:
     """Trace particles through the scene and keep their hits.
 
-    A particle heavier than the window is split in two at every vertex it meets.  A path holds at most one
-    twin in waiting and traces it when it ends; with one waiting already, or no room for its hits, there is no split
-    (our choice: one kernel, no queue).
+    A weight window keeps particles alike, by roulette below it and by splitting above it.
+
+    One kernel, of lanes that each trace their share of the paths one after another: a path that splits often keeps no
+    others waiting.  Copies wait in a small stack of the lane; there is no split without room there, or in the
+    lane's share of the buffers for all hits that may still follow.
 
     Args:
         rays: where the particles start.
+        sampler: as wide as the rays.
         guide: the distributions that guide scattering: importance for photons, radiance for importons.
         max_depth: longest camera path; a particle's path joins a camera path by one segment at least.
         mode: `Importance` for photons (which then correct for shading normals), `Radiance` for importons.
+        window: what to keep alike; None keeps the weights in the wide window of [L].
         emission: also keep how importons reach its lights, from the second vertex on: those that scatter there, and next-event
             estimates, without which none would find a directional light and few the sun (balance heuristic).
 
@@ -125,37 +173,47 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
     """
     n_paths = dr.width(rays.ray.o)
     last = (max_depth if max_depth >= 0 else UNBOUNDED_DEPTH) - 1     # last vertex at which a hit is of use
-    rows = 2 * max(last - 1, 1)                                       # of a path and its twins
-    if 4 * rows * n_paths >= 2 ** 32:
-        raise InputError(f"{n_paths} particles of up to {rows} hits in one trace: at most {(2 ** 32 - 1) // (4 * rows)}")
+    lanes = min(n_paths, LANES)
+    each = -(-n_paths // lanes)                                       # paths of a lane, rounded up
+    hits = max(last - 1, 1)                                           # of a path that does not split, at most
+    rows = 2 * hits * each
+    if 4 * rows * lanes >= 2 ** 32:
+        raise InputError(f"{n_paths} particles of up to {2 * hits} hits in one trace: at most {(2 ** 32 - 1) // (8 * hits)}")
     photons = mode == mi.TransportMode.Importance
     ctx = mi.BSDFContext(mode)
-    position, direction, normal = (dr.empty(mi.Float, 4 * rows * n_paths) for _ in range(3))
-    left_at, left_for = (dr.empty(mi.Float, 4 * (DEPARTURES * n_paths if emission else 1)) for _ in range(2))
-    path, n = dr.arange(mi.UInt32, n_paths), dr.opaque(mi.UInt32, n_paths)     # opaque: counts are data, not code
+    position, direction, normal = (dr.empty(mi.Float, 4 * rows * lanes) for _ in range(3))
+    left_at, left_for = (dr.empty(mi.Float, 4 * (DEPARTURES * each * lanes if emission else 1)) for _ in range(2))
+    # Opaque: counts are data, not code.
+    lane, n, n_lanes = dr.arange(mi.UInt32, lanes), dr.opaque(mi.UInt32, n_paths), dr.opaque(mi.UInt32, lanes)
+    capacity = dr.opaque(mi.UInt32, rows)
     unit = rays.unit
+    seed = mi.UInt32(dr.gather(mi.Float, sampler.next_1d(), dr.opaque(mi.UInt32, 0)) * 2 ** 24)
+    sampler = sampler.fork()
+    sampler.seed(seed, lanes)
 
-    ray = mi.Ray3f(rays.ray)
-    weight = mi.Spectrum(rays.weight)
+    path = mi.UInt32(lane)
+    ray = mi.Ray3f(dr.gather(mi.Point3f, rays.ray.o, path), dr.gather(mi.Vector3f, rays.ray.d, path))
+    weight = dr.gather(mi.Spectrum, rays.weight, path)
     depth = mi.UInt32(0)                            # vertices met so far
     count = mi.UInt32(0)                            # hits kept so far
-    active = dr.max(weight) > 0
-    # The twin in waiting: the ray that leads to the vertex where it was split, and its share of the weight there.
-    twin_ray, twin_weight, twin_depth, twin = dr.zeros(mi.Ray3f, n_paths), mi.Spectrum(0), mi.UInt32(0), mi.Bool(False)
-    met_before = mi.Bool(False)                     # the next vertex is one where a twin was split off
+    reserved = hits * ((n - 1 - lane) // n_lanes)   # room for the lane's further paths and for the copies in waiting
+    waiting = [dr.zeros(_Waiting, lanes) for _ in range(LEVELS)]       # the last split first; unused: no copies
+    met_before = mi.Bool(False)                     # the next vertex is one where a particle has been split
     left = mi.UInt32(0)                             # departures kept so far
     pdf_prev = mi.Float(0)                          # density with which the ray was chosen
+    active = mi.Bool(True)
 
     while active:
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
-        hit = active & si.is_valid()
+        hit = active & si.is_valid() & (dr.max(weight) > 0)
         depth[hit] += 1
         hit &= depth <= last
         bsdf = GuidedBSDF(si.bsdf(ray), si, guide, fraction, hit)
 
         # ---------------------- Keep the hit ----------------------
-        keep = hit & bsdf.smooth & (depth >= 2) & ~met_before
-        place = count * n + path
+        first_met = hit & ~met_before
+        keep = first_met & bsdf.smooth & (depth >= 2)
+        place = count * n_lanes + lane
         n_incident = dr.mulsign(si.n, -dr.dot(si.n, ray.d))
         dr.scatter(position, mi.Vector4f(si.p.x, si.p.y, si.p.z, mi.luminance(weight)), place, keep)
         dr.scatter(direction, mi.Vector4f(-ray.d.x, -ray.d.y, -ray.d.z, si.t), place, keep)
@@ -166,33 +224,42 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         if dr.hint(emission is not None, mode="scalar"):
             assert emission is not None
             # By next-event estimation or by the ray itself; a lane does one or the other.
-            connect = keep & (left < DEPARTURES)
+            room_left = left < DEPARTURES * (path // n_lanes + 1)
+            connect = keep & room_left
             ds, radiance = scene.sample_emitter_direction(si, sampler.next_2d(connect), True, connect)
             light = emission.index(ds.emitter)
             value, pdf = bsdf.eval_pdf(ctx, si.to_local(ds.d), connect & (ds.pdf > 0))
             mis = dr.select(ds.delta, 1, ds.pdf / (ds.pdf + pdf))
             connect &= (ds.pdf > 0) & (light < len(emission.lights))
-            escape = active & ~si.is_valid() & (depth >= 2) & (left < DEPARTURES)
+            escape = active & ~si.is_valid() & (depth >= 2) & room_left
             ray_radiance, ray_mis = emission.escape(si, pdf_prev, escape)
             carried = mi.luminance(weight * dr.select(escape, ray_radiance * ray_mis, value * radiance * mis))
             leaves = (connect | escape) & (carried > 0) & dr.isfinite(carried)
             p, d = dr.select(escape, ray.o, si.p), dr.select(escape, ray.d, ds.d)
-            dr.scatter(left_at, mi.Vector4f(p.x, p.y, p.z, carried), left * n + path, leaves)
-            dr.scatter(left_for, mi.Vector4f(d.x, d.y, d.z, dr.select(escape, 0, mi.Float(light))), left * n + path, leaves)
+            dr.scatter(left_at, mi.Vector4f(p.x, p.y, p.z, carried), left * n_lanes + lane, leaves)
+            dr.scatter(left_for, mi.Vector4f(d.x, d.y, d.z, dr.select(escape, 0, mi.Float(light))), left * n_lanes + lane, leaves)
             left[leaves] += 1
 
         # ---------------------- Weight window ----------------------
         relative = mi.luminance(weight) / unit
-        room = count + 2 * (last - depth) <= rows           # for what the particle and its twin may still leave
-        split = hit & ~twin & (relative > HEAVIEST) & (depth < last) & room
-        weight[split] *= 0.5
-        twin_ray = dr.select(split, ray, twin_ray)
-        twin_weight = dr.select(split, weight, twin_weight)
-        twin_depth = dr.select(split, depth - 1, twin_depth)
-        twin |= split
-        light = hit & (relative < LIGHTEST)
-        survives = sampler.next_1d(light) * LIGHTEST < relative
-        weight[light] *= LIGHTEST / relative
+        low, high, least = mi.Float(LIGHTEST), mi.Float(HEAVIEST), mi.Float(0)
+        if dr.hint(window is not None and bsdf.guided is not None, mode="scalar"):
+            assert window is not None and bsdf.guided is not None
+            value = dr.gather(mi.Float, window.value, bsdf.guided.record, bsdf.guided.found)
+            known = value > 0
+            relative = dr.select(known, mi.luminance(weight) * value / window.aim, relative)
+            low, high, least = dr.select(known, LOW, low), dr.select(known, HIGH, high), dr.select(known, LEAST_SURVIVAL, 0)
+        further = dr.select(first_met & (depth < last), last - depth, 0)        # hits to come of each copy
+        room = mi.Float(capacity - count - reserved) / mi.Float(dr.maximum(further, 1))
+        copies = dr.minimum(dr.round(relative), dr.minimum(MOST_COPIES, dr.floor(room)))
+        split = (further > 0) & (relative > high) & (copies >= 2) & (waiting[LEVELS - 1].copies == 0)
+        weight[split] /= copies
+        waiting = _push(waiting, _Waiting(ray.o, ray.d, weight, depth - 1, mi.UInt32(copies) - 1), split)
+        reserved[split] += (mi.UInt32(copies) - 1) * further
+        light = first_met & (relative < low)
+        survival = dr.select(light, dr.maximum(relative / low, least), 1)
+        survives = sampler.next_1d(light) < survival
+        weight /= survival
 
         # ---------------------- Scatter ----------------------
         scatter = hit & (~light | survives) & (depth < last)
@@ -208,29 +275,35 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         alive = scatter & (dr.max(weight) > 0)
         if dr.hint(emission is not None, mode="scalar"):
             pdf_prev = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.largest(mi.Float), bs.pdf)
+        ray = si.spawn_ray(d)
 
-        # ---------------------- Go on, or with the twin ----------------------
-        next_ray = si.spawn_ray(d)
-        resume = active & ~alive & twin
-        ray = dr.select(resume, twin_ray, next_ray)
-        weight = dr.select(resume, twin_weight, weight)
-        depth = dr.select(resume, twin_depth, depth)
-        twin &= ~resume
+        # ---------------------- Go on, or with a copy in waiting, or with the next path ----------------------
+        ended = active & ~alive
+        resume = ended & (waiting[0].copies > 0)
+        twin, waiting = _pop(waiting, resume)
+        reserved[resume] -= last - 1 - twin.depth
+        path[ended & ~resume] += n_lanes
+        start = ended & ~resume & (path < n)
+        reserved[start] -= hits
+        ray.o = dr.select(resume, twin.o, dr.select(start, dr.gather(mi.Point3f, rays.ray.o, path, start), ray.o))
+        ray.d = dr.select(resume, twin.d, dr.select(start, dr.gather(mi.Vector3f, rays.ray.d, path, start), ray.d))
+        weight = dr.select(resume, twin.weight, dr.select(start, dr.gather(mi.Spectrum, rays.weight, path, start), weight))
+        depth = dr.select(resume, twin.depth, dr.select(start, 0, depth))
         met_before = mi.Bool(resume)
-        active &= alive | resume
+        active &= alive | resume | start
 
     dr.eval(position, direction, normal, count, left_at, left_for, left)
-    place = _places(count, rows)
-    departures = _departures(left_at, left_for, _places(left, DEPARTURES)) if emission is not None else None
-    return Particles(position, direction, normal, place, departures)
+    place = places(count, rows)
+    departures = _departures(left_at, left_for, places(left, DEPARTURES * each)) if emission is not None else None
+    return Particles(position, direction, normal, place, lanes, departures)
 
 
-def _places(count: mi.UInt32, rows: int) -> mi.UInt32:
-    """Those in use, path by path, of `rows` places a path."""
+def places(count: mi.UInt32, rows: int) -> mi.UInt32:
+    """Those in use, lane by lane, of `rows` places a lane."""
     entry = dr.arange(mi.UInt32, rows * len(count))
-    path, row = entry // rows, entry % rows
-    used = dr.compress(row < dr.gather(mi.UInt32, count, path))
-    return dr.gather(mi.UInt32, row * dr.opaque(mi.UInt32, len(count)) + path, used)
+    lane, row = entry // rows, entry % rows
+    used = dr.compress(row < dr.gather(mi.UInt32, count, lane))
+    return dr.gather(mi.UInt32, row * dr.opaque(mi.UInt32, len(count)) + lane, used)
 
 
 def _departures(left_at: mi.Float, left_for: mi.Float, place: mi.UInt32) -> Departures:

@@ -82,6 +82,8 @@ class TrainingSettings:
     emission: "guided" starts photons of lights at infinity (constant, envmap, sunsky, directional) where importons leave for
         them; "emitter" by the emitters' own samplers.
     emission_fraction: probability of the emitter's own sampler in guided emission, its defensive share [T 113-117].
+    window: what the particles' roulette and splitting keep alike: "contribution", that which they are expected to make to
+        the image, or to the light that it receives (Vorba and Křivánek 2016); "flux", their weights, in a wide window [L].
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
     schedule: Literal["interleaved", "single_batch"] = "interleaved"
@@ -100,11 +102,14 @@ class TrainingSettings:
     learn_fraction: bool = True
     emission: Literal["guided", "emitter"] = "guided"
     emission_fraction: float = 0.2
+    window: Literal["flux", "contribution"] = "contribution"
 
     def __post_init__(self) -> None:
         _require_types(self)
         _require_choice(self, "schedule", "interleaved", "single_batch")
         _require_choice(self, "gather", "binned", "nearest")
+        _require_choice(self, "emission", "guided", "emitter")
+        _require_choice(self, "window", "flux", "contribution")
         for name in ("passes", "importons", "camera_passes"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), ">= 0")
         for name in ("photons", "camera_paths", "neighbours"):
@@ -112,7 +117,6 @@ class TrainingSettings:
         _require(0 < self.share <= 1, "share", self.share, "in (0, 1]")
         _require(0 < self.record_radius <= 0.25, "record_radius", self.record_radius, "in (0, 0.25] of the scene's diagonal")
         _require(0 < self.fraction <= 1, "fraction", self.fraction, "in (0, 1]")
-        _require(self.emission in ("guided", "emitter"), "emission", self.emission, "'guided' or 'emitter'")
         _require(0 < self.emission_fraction <= 1, "emission_fraction", self.emission_fraction, "in (0, 1]")
 
 
@@ -121,17 +125,15 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
     _require(getattr(settings, name) in choices, name, getattr(settings, name), f"{', '.join(most)} or {last}")
 
 
+# The talk's particles, gather and schedule [T, L]: photons and importons only, a fixed fraction.
+_PAPER = {"gather": "nearest", "record_radius": 0.01, "passes": 10, "importons": 300_000, "camera_passes": 0,
+          "learn_fraction": False, "window": "flux"}
+
 # What each preset changes of the defaults, which are those of `best`.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "best": {"training": {}, "integrator": {}},
-    # The talk's own particles, gather and roulette [T, L].
-    "paper2014": {"training": {"gather": "nearest", "record_radius": 0.01, "passes": 10, "importons": 300_000, "camera_passes": 0,
-                               "learn_fraction": False},
-                  "integrator": {"roulette": "throughput"}},
-    # The same without roulette, which kills guided paths: they carry low throughput for a reason.
-    "paper2014_norr": {"training": {"gather": "nearest", "record_radius": 0.01, "passes": 10, "importons": 300_000,
-                                    "camera_passes": 0, "learn_fraction": False},
-                       "integrator": {"roulette": "none"}},
+    "paper2014": {"training": _PAPER, "integrator": {"roulette": "throughput"}},
+    "paper2014_norr": {"training": _PAPER, "integrator": {"roulette": "none"}},      # guided paths carry low throughput
 }
 
 Settings = TypeVar("Settings")

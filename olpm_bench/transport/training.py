@@ -30,6 +30,7 @@ from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
 from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings
+from olpm_bench.transport.window import by_contribution
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)      # of linear sRGB, as mi.luminance
 
@@ -45,6 +46,7 @@ class PassStatistics:
     stored: int = 0                 # hits of photons, or vertices of camera paths
     kept: int = 0                   # of which taught a record
     records: int = 0                # of the radiance guide
+    regions: dict[str, np.ndarray] = field(default_factory=dict)    # where a caller names them: `Particles.by_region`
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("trace", "grow", "gather", "update"), 0.0))
     image: mi.TensorXf | None = field(default=None, repr=False)
 
@@ -117,13 +119,15 @@ class Training:
         integrator: that will use the guide: depth, roulette and fraction of the camera passes.
         seed: everything random follows from it.
         sensor: the camera, from which importons start; the scene's first by default.
+        regions: of positions [n, 3], the index of their region, and the number of regions: for the statistics.
 
     Raises:
         InputError: the scene can't be guided; the message says why.
     """
 
     def __init__(self, scene: mi.Scene, representation: str | dict[str, Any], settings: TrainingSettings,
-                 integrator: IntegratorSettings, seed: int = 0, sensor: mi.Sensor | None = None) -> None:
+                 integrator: IntegratorSettings, seed: int = 0, sensor: mi.Sensor | None = None,
+                 regions: tuple[Callable[[np.ndarray], np.ndarray], int] | None = None) -> None:
         from olpm_bench.transport.path import GuidedPathIntegrator  # whose base class exists once a variant is set
 
         check_traceable(scene)
@@ -138,9 +142,12 @@ class Training:
         self.spp = 0                                    # ... and their samples a pixel
         self.emission = EmissionGuide(scene, bounds, settings.emission_fraction) if (
             settings.emission == "guided" and settings.schedule == "interleaved" and distant_lights(scene)) else None
+        self.regions = regions
         self.sensor = sensor or scene.sensors()[0]
         self.sampler = mi.load_dict({"type": "independent"})
         self.draws = 0                      # seeds used so far
+        # Of photons and importons: hits a particle leaves in their first pass, and what the window is told for as many.
+        self.hits: dict[mi.TransportMode, tuple[float, float]] = {}
 
     def run(self) -> Iterator[PassStatistics]:
         """Train as the settings say, one pass at each step.  Who stops early has a guide as good as the passes done."""
@@ -163,9 +170,9 @@ class Training:
         """Importons, then photons, each guided by what the other has learnt so far."""
         s = self.settings
         if s.importons:
-            importons = self._trace(partial(emit_importons, self.sensor), s.importons, self.radiance, mi.TransportMode.Radiance,
-                                    statistics)
-            self._learn(self.importance, importons, statistics)
+            importons = self._trace(partial(emit_importons, self.sensor), s.importons, self.radiance, self.importance,
+                                    mi.TransportMode.Radiance, statistics)
+            self._learn(self.importance, importons, s.importons, statistics)
             if self.emission is not None and importons.departures is not None:
                 with _Seconds(statistics, "update"):
                     self.emission.learn(importons.departures, self._next_seed())
@@ -178,21 +185,33 @@ class Training:
 
     def _photons(self, n: int, importance: Guide | None, statistics: PassStatistics) -> PassStatistics:
         emit = self.emission.emit if self.emission is not None else partial(emit_photons, self.scene)
-        photons = self._trace(emit, n, importance, mi.TransportMode.Importance, statistics)
-        statistics.kept = self._learn(self.radiance, photons, statistics)
+        photons = self._trace(emit, n, importance, self.radiance, mi.TransportMode.Importance, statistics)
+        statistics.kept = self._learn(self.radiance, photons, n, statistics)
         statistics.photons, statistics.stored = n, len(photons)
         statistics.records = self.radiance.records
         return statistics
 
-    def _trace(self, emit: Callable[[mi.Sampler], ParticleRays], n: int, guide: Guide | None, mode: mi.TransportMode,
-               statistics: PassStatistics) -> Particles:
+    def _trace(self, emit: Callable[[mi.Sampler], ParticleRays], n: int, guide: Guide | None, own: Guide,
+               mode: mi.TransportMode, statistics: PassStatistics) -> Particles:
+        """Particles that `guide` guides and `own` will learn from."""
         with _Seconds(statistics, "trace"):
             self.sampler.seed(dr.opaque(mi.UInt32, self._next_seed()), n)
             rays = emit(self.sampler)
+            window, (wanted, told) = None, self.hits.get(mode, (0.0, 0.0))
+            if self.settings.window == "contribution" and told and guide is not None and guide.records and own.records:
+                window = by_contribution(guide, own, told, rays.unit / dr.opaque(mi.Float, n))
             emission = self.emission if mode == mi.TransportMode.Radiance else None
-            return trace(self.scene, rays, self.sampler, guide, self.settings.fraction, self.max_depth, mode, emission)
+            particles = trace(self.scene, rays, self.sampler, guide, self.settings.fraction, self.max_depth, mode, window,
+                              emission)
+            if len(particles):
+                left = len(particles) / n
+                self.hits[mode] = (wanted, told * wanted / left) if window else (left, left)
+        if self.regions is not None:
+            kind = "photons" if mode == mi.TransportMode.Importance else "importons"
+            statistics.regions[kind] = particles.by_region(*self.regions)
+        return particles
 
-    def _learn(self, guide: Guide, particles: Particles, statistics: PassStatistics) -> int:
+    def _learn(self, guide: Guide, particles: Particles, emitted: int, statistics: PassStatistics) -> int:
         if len(particles) == 0:             # nothing of this pass has reached a second surface
             return 0
         with _Seconds(statistics, "grow"):
@@ -201,7 +220,7 @@ class Training:
         with _Seconds(statistics, "gather"):
             batch = GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours)
         with _Seconds(statistics, "update"):
-            guide.learn_particles(batch, self._next_seed())
+            guide.learn_particles(batch, self._next_seed(), emitted)
         return len(batch)
 
     def _camera_pass(self, statistics: PassStatistics) -> PassStatistics:

@@ -1,6 +1,7 @@
 """Guided emission: the density it states is the one it samples, photons carry the same flux, and more of them come in."""
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -13,11 +14,14 @@ from small_scenes import box, grey, lamp, wall
 from olpm_bench.transport import emission
 from olpm_bench.transport.emission import EmissionGuide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
-from olpm_bench.transport.settings import training as settings
+from olpm_bench.transport.settings import IntegratorSettings
+from olpm_bench.transport.settings import training as with_defaults
 from olpm_bench.transport.training import Training, surface_bounds, train
 from representations import state as states
 
 DEPTH, N = 6, 200_000
+PATHS = IntegratorSettings(max_depth=DEPTH)
+settings = partial(with_defaults, camera_passes=0)
 SMALL = settings(passes=3, photons=20_000, importons=20_000, record_radius=0.08)
 WHITE = {"type": "rgb", "value": 1.0}
 SKY = np.random.default_rng(0).gamma(0.3, size=(16, 32, 1)) * np.ones(3)
@@ -59,7 +63,8 @@ def learnt(scene: mi.Scene, fraction: float = 0.2, passes: int = 3) -> EmissionG
     guide = EmissionGuide(scene, surface_bounds(scene), fraction)
     for i in range(passes):
         s = sampler(i, 50_000)
-        importons = trace(scene, emit_importons(scene.sensors()[0], s), s, None, 0.5, DEPTH, mi.TransportMode.Radiance, guide)
+        importons = trace(scene, emit_importons(scene.sensors()[0], s), s, None, 0.5, DEPTH, mi.TransportMode.Radiance,
+                          emission=guide)
         guide.learn(importons.departures, i)
     assert guide.learnt
     return guide
@@ -70,11 +75,11 @@ def photons(scene: mi.Scene, rays: ParticleRays, s: mi.Sampler) -> Particles:
 
 
 def inside(particles: Particles) -> tuple[np.ndarray, int]:
-    """Flux that each path has left on the floor of the room [N], and how many paths have."""
+    """Flux that the paths of each lane have left on the floor of the room, and how many hits there are."""
     p, weight, _, _, n = particles.read(particles.place)
     floor = (dr.abs(p.z + 1) < 1e-3) & (n.z > 0.5) & (dr.abs(p.x) < 1) & (dr.abs(p.y) < 1)
-    path = particles.place.numpy()[floor.numpy()] % N
-    return np.bincount(path, weight.numpy()[floor.numpy()], N), len(np.unique(path))
+    lane = particles.place.numpy()[floor.numpy()] % particles.lanes
+    return np.bincount(lane, weight.numpy()[floor.numpy()], particles.lanes), len(lane)
 
 
 def assert_same_mean(a: np.ndarray, b: np.ndarray, tests: int, level: float = 0.01) -> None:
