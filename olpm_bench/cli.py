@@ -143,6 +143,8 @@ def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedd
            save_guide: Annotated[Path | None, typer.Option(metavar="FILE.npz", show_default=False)] = None,
            load_guide: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="Use this guide; train none.",
                                                            show_default=False)] = None,
+           records_map: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the guide's records over the image.",
+                                                            show_default=False)] = None,
            ) -> None:
     """Render one image; the last line printed is one JSON object."""
     from olpm_bench.bench import environment
@@ -155,7 +157,7 @@ def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedd
 
     spec = render_one.cell(scene, method, set_, seconds=seconds, spp=spp, width=width, height=height,
                            max_depth=max_depth, seed=seed, load_guide=load_guide)
-    done = render_one.render(spec, out, save_guide=save_guide, load_guide=load_guide)
+    done = render_one.render(spec, out, save_guide=save_guide, load_guide=load_guide, records_map=records_map)
     print(json.dumps(plain(done), allow_nan=False))
 
 

@@ -28,6 +28,18 @@ def append(state: State, more: State) -> State:
     return dataclasses.replace(state, **fields)  # type: ignore[type-var]
 
 
+def copy_records(array: Any, n_records: int, source: Any, target: Any) -> Any:
+    """An array in which the records `target` are copies of the records `source` (UInt32 [k], k > 1)."""
+    tp, stride = dr.uint32_array_t(type(array)), len(array) // n_records
+    i, stride = dr.arange(tp, len(source) * stride), dr.opaque(tp, stride)
+    k, within = i // stride, i % stride
+    values = dr.gather(type(array), array, dr.gather(tp, source, k) * stride + within)
+    dr.eval(values)
+    result = type(array)(array)
+    dr.scatter(result, values, dr.gather(tp, target, k) * stride + within)
+    return result
+
+
 def bytes_of(state: Any) -> int:
     """Bytes held by all arrays of a state."""
     return sum(len(getattr(state, f.name)) * dr.itemsize_v(getattr(state, f.name))

@@ -12,8 +12,9 @@ from olpm_bench.bench import environment, run
 from olpm_bench.bench.config import CellSpec, ConfigError, parse
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.results import replacing, write_exr
-from olpm_bench.report import tonemap
-from olpm_bench.transport.guide import Guide
+from olpm_bench.report import records, tonemap
+from olpm_bench.transport.guide import MIN_PARTICLES, Guide
+from olpm_bench.transport.view import records_seen
 
 TABLES = ("scene", "integrator", "training", "representation")
 
@@ -86,11 +87,12 @@ def cell(scene: str, method: str, assignments: list[str], *, seconds: float | No
 
 
 def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
-           load_guide: Path | None = None) -> dict[str, Any]:
+           load_guide: Path | None = None, records_map: Path | None = None) -> dict[str, Any]:
     """Render one image to `out` (EXR: mean, variance of the mean, count) and, tone-mapped, to the PNG beside it.
 
     Args:
         save_guide, load_guide: where to leave the trained guide; which guide to use in place of training.
+        records_map: where to draw the guide's records over the image.
 
     Returns:
         Timings, counts and versions, for JSON.
@@ -100,9 +102,11 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
     """
     if out.suffix.lower() != ".exr":
         raise ConfigError(f"--out {out}: must end in .exr")
-    if spec.training is None and (save_guide or load_guide):
-        raise ConfigError("--save-guide and --load-guide need a --method with a representation")
-    for path in (out, save_guide):
+    if spec.training is None and (save_guide or load_guide or records_map):
+        raise ConfigError("--save-guide, --load-guide and --records-map need a --method with a representation")
+    if records_map is not None and records_map.suffix.lower() not in (".png", ".pdf"):
+        raise ConfigError(f"--records-map {records_map}: must end in .png or .pdf")
+    for path in (out, save_guide, records_map):
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: there is no folder {path.parent}")
     guide = _load_guide(load_guide, spec) if load_guide is not None else None
@@ -117,12 +121,15 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
     if save_guide is not None and done.guide is not None:
         with replacing(save_guide) as beside:
             done.guide.save(beside)
+    if records_map is not None and done.guide is not None:
+        records.records_map(records_seen(scene, done.guide), done.image["mean"], MIN_PARTICLES, records_map)
     info = {k: v for k, v in done.info.items() if k != "key"}
     write_exr(out, done.image, {**config, **info})
     png = out.with_suffix(".png")
     tonemap.write_png(png, tonemap.srgb(done.image["mean"], tonemap.auto_exposure(done.image["mean"])))
     return {**info, **config, "out": str(out), "png": str(png),
-            "guide": str(save_guide or load_guide) if save_guide or load_guide else None, "trace": done.trace,
+            "guide": str(save_guide or load_guide) if save_guide or load_guide else None,
+            "records_map": str(records_map) if records_map else None, "trace": done.trace,
             "versions": environment.versions(), "variant": mi.variant(), "commit": environment.commit()}
 
 

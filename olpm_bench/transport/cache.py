@@ -6,14 +6,18 @@ made its queries 9 times slower than those of a spatial tree (Mueller 2017).  He
 r_max / 2 times the six faces of the normal, and each cell in which particles have landed holds the index of
 the best record for them.  A query reads its cell and checks the record it finds there.
 
-Records grow where particles land: each newly met cell is represented by the first particle in it; a maximal
-independent set of those that no record covers (no two within R of each other) become records.  All is decided by the
-order of particles and never by the scheduling of threads.
+Where that is too coarse a cell is *split* into 32, halved along x, y, z and both coordinates of its face, up to
+`LEVELS` times: where a record is smaller than two edges of the cell, and where points in it miss the record that the
+cell holds because their normals differ.  So a query reads its cell and at most `LEVELS` more.
 
-Simpler than the paper: R is the same for all records, and they do not shrink near sources or where lobes are sharp.
+Records grow where particles land: each newly met cell is represented by the first particle in it; a maximal
+independent set of those that no record covers (no two within the smaller of their radii) become records.  When a record
+shrinks, cells that it no longer covers and no other record does are given up, and the next particle in them starts anew.
+All is decided by the order of particles and never by the scheduling of threads.
 """
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,14 +27,24 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from olpm_bench.transport.settings import InputError
+from representations.state import join
 
-MISSING = 0xFFFFFFFF            # cell without a record
 MIN_COSINE = 0.751              # 2 sqrt(1.001 - n.n') <= 1: the largest angle between the normals of point and record [L]
-CELL = 0.5                      # edge of a voxel / validity radius
-REACH = 1 + CELL * 3 ** 0.5     # a cell within R of its record may extend by its own diagonal beyond
+NEAR_COSINE = 0.4               # of the normals of records that clamp each other's radii [L]
+SAME = 0.9998                   # cosine between the normals of records that can share what they have learnt: 1 degree
+SMALLEST = 0.1                  # smallest validity radius / r_max [L]
+STEADY = 0.9                    # radii that would shrink to more than this part of what they are stay: fewer cells to redo
+CELL = 0.5                      # edge of a voxel / r_max, and of a split one / validity radius
+LEVELS = 3                      # times that a cell can be split
+CHILDREN = 32
 NEIGHBOURS = 8                  # nearest records among which the best for a cell is sought
 LEAST = 2                       # fewer new cells or records wait: Dr.Jit compiles arrays of one entry to other kernels
+FEW = 100                       # points that are still new after others have been served wait
 MOST_CELLS = 2 ** 27            # of a table: 512 MB
+MOST_RECORDS = 2 ** 17
+
+# An entry of the table: SPLIT + block of children, or a record; UNKNOWN if it was chosen for another cell, or MISSING.
+SPLIT, UNKNOWN, MISSING = 1 << 31, 1 << 30, (1 << 31) - 1
 
 
 @dataclass
@@ -56,10 +70,10 @@ class Grid:
         opaque = [dr.opaque(mi.Float, float(x)) for x in low], [dr.opaque(mi.UInt32, int(x)) for x in size]
         return Grid(mi.Point3f(opaque[0]), dr.opaque(mi.Float, 1 / edge), mi.Vector3u(opaque[1]), 6 * int(np.prod(size)))
 
-    def coordinates(self, p: mi.Point3f) -> mi.Vector3u:
-        """Voxel of a point; points outside the box go to its border."""
-        x = mi.Vector3i(dr.floor((p - self.origin) * self.inverse_edge))
-        return mi.Vector3u(dr.clip(x, 0, mi.Vector3i(self.size) - 1))
+    def coordinates(self, p: mi.Point3f, level: int = 0) -> mi.Vector3u:
+        """Voxel of a point, of edges halved `level` times; points outside the box go to its border."""
+        x = mi.Vector3i(dr.floor((p - self.origin) * self.inverse_edge * 2 ** level))
+        return mi.Vector3u(dr.clip(x, 0, (mi.Vector3i(self.size) << level) - 1))
 
     def voxel(self, p: mi.Point3f) -> mi.UInt32:
         """Index of that voxel; neighbours along x follow one another."""
@@ -68,11 +82,51 @@ class Grid:
 
     def cell(self, p: mi.Point3f, n: mi.Normal3f) -> mi.UInt32:
         """Index of the cell of a point and normal: six faces a voxel."""
-        a = dr.abs(n)
-        axis = dr.select((a.x >= a.y) & (a.x >= a.z), mi.UInt32(0), dr.select(a.y >= a.z, mi.UInt32(1), 2))
-        sign = dr.select(axis == 0, n.x, dr.select(axis == 1, n.y, n.z)) < 0
-        face = 2 * axis + dr.select(sign, mi.UInt32(1), 0)
-        return face + 6 * self.voxel(p)
+        axis, along, _, _ = _face(n)
+        return 2 * axis + dr.select(along < 0, mi.UInt32(1), 0) + 6 * self.voxel(p)
+
+    def child(self, p: mi.Point3f, n: mi.Normal3f, level: mi.UInt32 | int) -> mi.UInt32:
+        """Which child of its cell, split `level` times, holds a point and normal: a bit for each of x, y, z, u, v."""
+        _, along, u, v = _face(n)
+        scale = 2 ** (LEVELS - 1) / dr.abs(along)
+        face = (mi.UInt32(dr.clip(mi.Int32(x * scale + 2 ** (LEVELS - 1)), 0, 2 ** LEVELS - 1)) for x in (u, v))
+        shift, child = LEVELS - 1 - mi.UInt32(level), mi.UInt32(0)
+        for i, x in enumerate((*self.coordinates(p, LEVELS), *face)):
+            child |= ((x >> shift) & 1) << i
+        return child
+
+
+def _face(n: mi.Normal3f) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Float]:
+    """The axis closest to a normal, the normal's component along it, and the other two in order."""
+    a = dr.abs(n)
+    x, y = (a.x >= a.y) & (a.x >= a.z), a.y >= a.z
+    axis = dr.select(x, mi.UInt32(0), dr.select(y, mi.UInt32(1), 2))
+    along = dr.select(x, n.x, dr.select(y, n.y, n.z))
+    return axis, along, dr.select(x, n.y, n.x), dr.select(x | y, n.z, n.y)
+
+
+@dataclass
+class Cells:
+    """The occupied cells, each with the point that represents it."""
+    slot: np.ndarray        # [n] uint32: of the table
+    level: np.ndarray       # [n] uint8: times split
+    path: np.ndarray        # [n] uint16: which child holds the point, and which child of that, 5 bits a level
+    record: np.ndarray      # [n] uint32: the best for the point
+    point: np.ndarray       # [n, 6] float32: p, n
+
+    @staticmethod
+    def none() -> Cells:
+        return Cells(np.zeros(0, np.uint32), np.zeros(0, np.uint8), np.zeros(0, np.uint16), np.zeros(0, np.uint32),
+                     np.zeros((0, 6), np.float32))
+
+    def __len__(self) -> int:
+        return len(self.slot)
+
+    def take(self, which: np.ndarray) -> Cells:
+        return Cells(*(field[which] for field in vars(self).values()))
+
+    def and_then(self, more: Cells) -> Cells:
+        return Cells(*(np.concatenate([vars(self)[name], vars(more)[name]]) for name in vars(self)))
 
 
 class RecordCache:
@@ -80,108 +134,240 @@ class RecordCache:
 
     Args:
         bbox: the scene's bounding box.
-        record_radius: validity radius R in units of the box's diagonal.
+        record_radius: largest validity radius r_max, with which records begin, in units of the box's diagonal.
     """
 
     def __init__(self, bbox: mi.ScalarBoundingBox3f, record_radius: float) -> None:
         self.bbox, self.record_radius = bbox, record_radius
-        self.radius = record_radius * float(dr.norm(bbox.extents()))         # [scene units]
+        self.radius = record_radius * float(dr.norm(bbox.extents()))         # r_max [scene units]
         self.grid = Grid.over(bbox, CELL * self.radius)
-        self.table = dr.full(mi.UInt32, MISSING, self.grid.n_cells)
-        self.rows = dr.zeros(mi.Float, 0)                           # [n * 8] p, squared reach, n, unused
-        self.points = np.zeros((0, 6), np.float32)                  # records: p, n
-        self.cells = np.zeros(0, np.uint32)                         # occupied cells, ...
-        self.cell_points = np.zeros((0, 6), np.float32)             # ... and the point that represents each
+        self.table = dr.full(mi.UInt32, MISSING, self.grid.n_cells)  # [n_cells + CHILDREN * blocks]
+        self.n_roots = dr.opaque(mi.UInt32, self.grid.n_cells)
+        self.rows = dr.zeros(mi.Float, 0)                           # [n * 8] p, squared reach, n, R
+        self.points = np.zeros((0, 6), np.float32)                  # records: p, n, ...
+        self.radii = np.zeros(0, np.float32)                        # ... R [scene units]
+        self.cells = Cells.none()
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def row(self, record: mi.UInt32, active: mi.Bool = True) -> tuple[mi.Point3f, mi.Normal3f, mi.Float]:
-        """Position, normal (the n of its frame) and squared reach of records."""
+    def row(self, record: mi.UInt32, active: mi.Bool = True) -> tuple[mi.Point3f, mi.Normal3f, mi.Float, mi.Float]:
+        """Position, normal (the n of its frame), squared reach and validity radius of records.
+
+        A point may lie a cell's diagonal farther from its record than the one that represents the cell.
+        """
         row = dr.gather(mi.ArrayXf, self.rows, record, active, shape=(8, dr.width(record)))
-        return mi.Point3f(row[0], row[1], row[2]), mi.Normal3f(row[4], row[5], row[6]), row[3]
+        return mi.Point3f(row[0], row[1], row[2]), mi.Normal3f(row[4], row[5], row[6]), row[3], row[7]
 
     def lookup(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Normal3f, mi.Bool]:
         """The record that serves a point with its normal: (index, the record's normal, whether there is one)."""
         if len(self) == 0:
             return mi.UInt32(0), mi.Normal3f(0, 0, 1), mi.Bool(False)
-        record = dr.gather(mi.UInt32, self.table, self.grid.cell(p, n), active)
-        found = active & (record != MISSING)
-        position, normal, reach2 = self.row(record, found)
+        return self._check(self._descend(p, n, active)[1], p, n, active)
+
+    @dr.syntax
+    def _descend(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """The cell of a point, the last that is not split: its slot of the table, the entry, its level."""
+        slot, level = self.grid.cell(p, n), mi.UInt32(0)
+        entry = dr.gather(mi.UInt32, self.table, slot, active)
+        while dr.hint(active & (entry >= SPLIT), mode="symbolic", label="split cells"):
+            slot = (entry ^ SPLIT) * CHILDREN + self.grid.child(p, n, level) + self.n_roots
+            entry = dr.gather(mi.UInt32, self.table, slot)
+            level += 1
+        return slot, entry, level
+
+    def _check(self, entry: mi.UInt32, p: mi.Point3f, n: mi.Normal3f,
+               active: mi.Bool) -> tuple[mi.UInt32, mi.Normal3f, mi.Bool]:
+        """Whether the record of a cell serves a point: as `lookup`."""
+        found = active & (entry != MISSING)
+        record = dr.select(found, entry & (UNKNOWN - 1), 0)
+        position, normal, reach2, _ = self.row(record, found)
         near = dr.squared_norm(p - position) <= reach2
-        return dr.select(found, record, 0), normal, found & near & (dr.dot(n, normal) >= MIN_COSINE)
+        return record, normal, found & near & (dr.dot(n, normal) >= MIN_COSINE)
+
+    # ---------------------- Growth ----------------------
 
     def grow(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> int:
-        """Add records for the points in cells that have none; returns how many.  Existing records keep their index."""
-        cell = self.grid.cell(p, n)
-        new = dr.compress(active & (dr.gather(mi.UInt32, self.table, cell, active) == MISSING))
-        if len(new) < LEAST:
-            return 0
-        cell = dr.gather(mi.UInt32, cell, new)
-        first = dr.full(mi.UInt32, MISSING, self.grid.n_cells)
-        dr.scatter_reduce(dr.ReduceOp.Min, first, new, cell)
-        cells = dr.compress(first != MISSING)
-        if len(cells) < LEAST:
-            return 0
-        representative = dr.gather(mi.UInt32, first, cells)
-        # By component: to turn a whole vector into NumPy compiles its length into a kernel.
-        points = np.stack([dr.gather(mi.Float, x, representative).numpy() for x in (*p, *n)], axis=1)
-        uncovered = self._best(points)[1] > self.radius
-        added = points[_independent(points, uncovered, self.radius)]
-        known = np.ones(len(points), bool)
-        if len(added) < LEAST:
-            added, known = added[:0], ~uncovered            # their cells stay new
+        """Add records for the points that have none; returns how many.  Existing records keep their index."""
+        before = len(self)
+        for i in range(LEVELS + 1):             # a cell may have to be split, and its child, and so on
+            new = dr.compress(self._is_new(p, n, active))
+            if len(new) < (FEW if i else LEAST):
+                break
+            p, n, active = dr.gather(mi.Point3f, p, new), dr.gather(mi.Normal3f, n, new), mi.Bool(True)
+            slot, entry, level = self._descend(p, n, active)
+            path = sum(self.grid.child(p, n, i) << 5 * i for i in range(LEVELS))
+            known = (entry & UNKNOWN) == 0
+            first = dr.full(mi.UInt32, MISSING, len(self.table))
+            dr.scatter_reduce(dr.ReduceOp.Min, first, dr.arange(mi.UInt32, len(new)), slot)
+            first = dr.gather(mi.UInt32, first, dr.compress(first != MISSING))
+            if len(first) < LEAST:
+                break
+            # By component: to turn a whole vector into NumPy compiles its length into a kernel.
+            slots, levels, paths, occupied, *point = (dr.gather(type(x), x, first).numpy()
+                                                      for x in (slot, level, path, known, *p, *n))
+            if occupied.any():                  # their records do not suit all points in them
+                order = np.argsort(self.cells.slot)
+                self._split(order[np.searchsorted(self.cells.slot, slots[occupied], sorter=order)])
+            self._enter(Cells(slots, levels.astype(np.uint8), paths.astype(np.uint16), np.zeros(len(slots), np.uint32),
+                              np.stack(point, axis=1)).take(~occupied))
+        return len(self) - before
+
+    def _is_new(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> mi.Bool:
+        """Whether the cell of a point is not occupied, or holds a record that does not suit the point and can be split."""
+        _, entry, level = self._descend(p, n, active)
+        known = active & ((entry & UNKNOWN) == 0)
+        if len(self) == 0:
+            return active & ~known
+        return active & (~known | (~self._check(entry, p, n, known)[2] & (level < LEVELS)))
+
+    def shrink(self, radius: np.ndarray) -> None:
+        """Let the first n records shrink to a radius [n, scene units], or to `SMALLEST`; they never grow."""
+        radius = np.maximum(radius, SMALLEST * self.radius).astype(np.float32)
+        smaller = np.zeros(len(self), bool)
+        smaller[:len(radius)] = radius < STEADY * self.radii[:len(radius)]
+        self.radii[smaller] = radius[smaller[:len(radius)]]
+        if smaller.any():
+            self._assign(smaller[self.cells.record])
+
+    def clamped(self, points: np.ndarray, own: bool = False) -> np.ndarray:
+        """R_near of points [n, 6]: the least distance + R over their nearest records that face alike, at most r_max [L].
+
+        Args:
+            own: the points are the records themselves, who do not clamp themselves.
+        """
+        near = np.full(len(points), self.radius)
+        k = min(NEIGHBOURS + own, len(self))
+        if k <= own or len(points) == 0:
+            return near
+        index, distance, cosine = _nearest(self.points, points, k, self.radius)
+        neighbour = (cosine > NEAR_COSINE) & (~own | (index != np.arange(len(points))[:, None]))
+        return np.minimum(near, np.where(neighbour, distance + self.radii[index], np.inf).min(1))
+
+    def parents(self, first: int) -> np.ndarray:
+        """Of each record from number `first` on, the nearest older one within r_max and with the same frame; -1 without."""
+        old, new = self.points[:first], self.points[first:]
+        if len(old) == 0 or len(new) == 0:
+            return np.full(len(new), -1)
+        index, distance, cosine = (x[:, 0] for x in _nearest(old, new, 1, self.radius))
+        same = (cosine > SAME) & (np.signbit(new[:, 5]) == np.signbit(old[index, 5]))   # tangents leap where n.z changes sign
+        return np.where(same & (distance <= self.radius), index, -1)
+
+    def _enter(self, cells: Cells) -> None:
+        """Occupy cells, and add the records that they need."""
+        if len(cells) == 0:
+            return
+        uncovered = self._best(cells.point)[1] == np.inf
+        radius = self.clamped(cells.point).astype(np.float32)
+        added = _independent(cells.point, uncovered, radius)
+        if len(self) + len(added) > MOST_RECORDS:
+            warnings.warn(f"{MOST_RECORDS} records: the rest of the surfaces stays unguided; make record_radius larger",
+                          stacklevel=4)
+            added = added[:MOST_RECORDS - len(self)]
+        added = added[:0] if len(added) < LEAST else added              # a single one waits
+        self.points = np.concatenate([self.points, cells.point[added]])
+        self.radii = np.concatenate([self.radii, radius[added]])
         # New cells need a record, and so do old ones with an added record near them: it may be better.
-        stale = np.concatenate([_near(self.cell_points, added, self.radius), np.ones(known.sum(), bool)])
-        self.cells = np.concatenate([self.cells, cells.numpy()[known]])
-        self.cell_points = np.concatenate([self.cell_points, points[known]])
-        self.points = np.concatenate([self.points, added])
-        self._tabulate(stale)
-        return len(added)
+        stale = np.concatenate([_near(self.cells.point, cells.point[added], self.radius), np.ones(len(cells), bool)])
+        self.cells = self.cells.and_then(cells)
+        self._assign(stale)
 
     def _best(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Per point, the record of smallest error and its distance (inf where no normal fits)."""
+        """Per point, the record of smallest error that covers it, and that error (inf where none does)."""
         k = min(NEIGHBOURS, len(self))
         if k == 0 or len(points) == 0:
             return np.zeros(len(points), np.intp), np.full(len(points), np.inf)
-        distance, index = cKDTree(self.points[:, :3]).query(points[:, :3], k=[*range(1, k + 1)], workers=dr.thread_count())
-        cosine = np.einsum("ij,ikj->ik", points[:, 3:], self.points[index, 3:])
-        error = np.where(cosine >= MIN_COSINE, distance / self.radius + 2 * np.sqrt(np.maximum(1.001 - cosine, 0)), np.inf)
+        index, distance, cosine = _nearest(self.points, points, k, self.radius)
+        covers = (cosine >= MIN_COSINE) & (distance <= self.radii[index])
+        error = np.where(covers, distance / self.radius + 2 * np.sqrt(np.maximum(1.001 - cosine, 0)), np.inf)
         best = np.argmin(error, axis=1, keepdims=True)
-        distance = np.where(np.isfinite(np.take_along_axis(error, best, 1)), np.take_along_axis(distance, best, 1), np.inf)
-        return np.take_along_axis(index, best, 1)[:, 0], distance[:, 0]
+        return np.take_along_axis(index, best, 1)[:, 0], np.take_along_axis(error, best, 1)[:, 0]
 
-    def _tabulate(self, stale: np.ndarray) -> None:
-        """Enter into the `stale` ones of the occupied cells the best record for the point that represents each."""
-        record, distance = self._best(self.cell_points[stale])
-        entry = np.where(distance <= self.radius, record, MISSING).astype(np.uint32)
-        dr.scatter(self.table, _copied(mi.UInt32, entry), _copied(mi.UInt32, self.cells[stale]))
+    def _assign(self, stale: np.ndarray) -> None:
+        """Enter into the `stale` ones of the occupied cells the best record for the point that represents each.
+
+        Cells that none covers are given up; those that are large for their record are split.
+        """
+        record, error = self._best(self.cells.point[stale])
+        self.cells.record[stale] = np.where(error < np.inf, record, MISSING)
+        self._write(self.cells.slot[stale], self.cells.record[stale])
+        self.cells = self.cells.take(self.cells.record != MISSING)
+        levels = self._levels()
+        while (large := self.cells.level < levels[self.cells.record]).any():
+            self._split(np.flatnonzero(large))
         rows = np.zeros((len(self), 8), np.float32)
-        rows[:, :3], rows[:, 3], rows[:, 4:7] = self.points[:, :3], (REACH * self.radius) ** 2, self.points[:, 3:]
-        self.rows = _copied(mi.Float, rows.ravel())
-        dr.eval(self.table, self.rows)
+        rows[:, :3], rows[:, 4:7], rows[:, 7] = self.points[:, :3], self.points[:, 3:], self.radii
+        rows[:, 3] = (self.radii + 3 ** 0.5 * CELL * self.radius * 0.5 ** levels) ** 2
+        self.rows = copied(mi.Float, rows.ravel())
+        dr.eval(self.rows)
+
+    def _levels(self) -> np.ndarray:
+        """How often the cells of each record are split, at least [n]."""
+        return np.clip(np.ceil(np.log2(self.radius / self.radii) - 1e-3), 0, LEVELS).astype(np.uint8)
+
+    def _split(self, which: np.ndarray) -> None:
+        """Split occupied cells: all children inherit the record, the one with the point that represents the cell keeps it."""
+        cells, old = self.cells.take(which), len(self.table)
+        block = (old - self.grid.n_cells) // CHILDREN + np.arange(len(cells), dtype=np.uint32)
+        slot = old + CHILDREN * np.arange(len(cells)) + (cells.path >> 5 * cells.level & (CHILDREN - 1))
+        children = np.repeat(cells.record | UNKNOWN, CHILDREN).astype(np.uint32)
+        children[slot - old] = cells.record
+        self.table = join(self.table, copied(mi.UInt32, children))
+        self._write(cells.slot, block | SPLIT)
+        self.cells.slot[which] = slot
+        self.cells.level[which] += 1
+
+    def _write(self, slot: np.ndarray, entry: np.ndarray) -> None:
+        """Entries of the table; a single one twice."""
+        if len(slot) == 1:
+            slot, entry = np.repeat(slot, 2), np.repeat(entry, 2)
+        if len(slot):
+            dr.scatter(self.table, copied(mi.UInt32, entry.astype(np.uint32)), copied(mi.UInt32, slot))
+        dr.eval(self.table)
+
+    # ---------------------- Files ----------------------
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """Everything needed to rebuild the cache, for files."""
-        return {"bbox": np.array([np.array(self.bbox.min).ravel(), np.array(self.bbox.max).ravel()]), "record_radius":
-                np.array(self.record_radius), "points": self.points, "cells": self.cells, "cell_points": self.cell_points}
+        table = self.table.numpy()
+        used = np.flatnonzero(table != MISSING).astype(np.uint32)
+        return {"bbox": np.array([np.array(self.bbox.min).ravel(), np.array(self.bbox.max).ravel()]),
+                "record_radius": np.array(self.record_radius), "points": self.points, "radii": self.radii,
+                "table_size": np.array(len(table)), "table_used": used, "table_entries": table[used],
+                **{f"cells_{name}": field for name, field in vars(self.cells).items()}}
 
     @staticmethod
     def from_numpy(arrays: dict[str, Any]) -> RecordCache:
         """The cache that `to_numpy` described."""
         bbox = mi.ScalarBoundingBox3f(*(mi.ScalarPoint3f(*map(float, corner)) for corner in arrays["bbox"]))
         cache = RecordCache(bbox, float(arrays["record_radius"]))
-        cache.points, cache.cells, cache.cell_points = (arrays[k] for k in ("points", "cells", "cell_points"))
+        cache.points, cache.radii = arrays["points"], arrays["radii"]
+        cache.cells = Cells(**{name: arrays[f"cells_{name}"] for name in vars(cache.cells)})
         if len(cache):
-            cache._tabulate(np.ones(len(cache.cells), bool))
+            table = np.full(int(arrays["table_size"]), MISSING, np.uint32)
+            table[arrays["table_used"]] = arrays["table_entries"]
+            cache.table = copied(mi.UInt32, table)
+            cache._assign(np.zeros(len(cache.cells), bool))
         return cache
 
 
-def _copied(dtype: Any, array: np.ndarray) -> Any:
+def copied(dtype: Any, array: np.ndarray) -> Any:
     """In Dr.Jit's own memory: NumPy's is aligned now this way, now that, and each way compiles other kernels."""
     copy = dr.gather(dtype, dtype(array), dr.arange(mi.UInt32, len(array)))
     dr.eval(copy)
     return copy
+
+
+def _nearest(points: np.ndarray, queries: np.ndarray, k: int, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The k nearest of points [n, 6] to each query: indices, distances, cosines between normals [queries, k].
+
+    Nearest by distance / radius and 2 sqrt(1 - n.n') as two sides of a right angle: those behind a thin wall are far.
+    """
+    points, queries = (np.hstack([x[:, :3] / radius, 2 ** 0.5 * x[:, 3:]]) for x in (points, queries))
+    _, index = cKDTree(points).query(queries, k=[*range(1, k + 1)], workers=dr.thread_count())
+    near = points[index]
+    return (index, radius * np.linalg.norm(near[..., :3] - queries[:, None, :3], axis=2),
+            0.5 * np.einsum("ij,ikj->ik", queries[:, 3:], near[..., 3:]))
 
 
 def _near(points: np.ndarray, others: np.ndarray, radius: float) -> np.ndarray:
@@ -191,24 +377,47 @@ def _near(points: np.ndarray, others: np.ndarray, radius: float) -> np.ndarray:
     return np.isfinite(cKDTree(others[:, :3]).query(points[:, :3], distance_upper_bound=radius)[0])
 
 
-def _independent(points: np.ndarray, candidates: np.ndarray, radius: float) -> np.ndarray:
-    """Indices of a maximal set of candidate points of which no two lie within `radius` with similar normals.
+def _independent(points: np.ndarray, candidates: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Indices of a maximal set of candidate points of which no two lie within the smaller of their radii with similar normals.
 
-    Luby's algorithm (1986): in each round the candidates that precede all their neighbours are chosen and their
-    neighbours leave.  The precedence is a fixed hash of the index.
+    By octaves of the radius, the largest first, so that few pairs are looked at.  In each, Luby's algorithm (1986):
+    in each round the candidates that precede all their neighbours are chosen and their neighbours leave.  The precedence
+    is a fixed hash of the index.
     """
-    index = np.flatnonzero(candidates)
-    pairs = cKDTree(points[index, :3]).query_pairs(radius, output_type="ndarray")
-    pairs = pairs[np.einsum("ij,ij->i", points[index[pairs[:, 0]], 3:], points[index[pairs[:, 1]], 3:]) >= MIN_COSINE]
-    rank = np.random.default_rng(0).permutation(len(index))
-    chosen, undecided = np.zeros(len(index), bool), np.ones(len(index), bool)
+    chosen = np.zeros(0, np.intp)
+    octave = np.full(len(points), -1)
+    octave[candidates] = np.floor(np.log2(radius.max(initial=1) / radius[candidates]))
+    for i in range(octave.max(initial=-1) + 1):
+        index = np.flatnonzero(octave == i)
+        index = index[~_covered(points, index, chosen, radius)]
+        chosen = np.concatenate([chosen, index[_luby(points[index], radius[index])]])
+    return chosen
+
+
+def _covered(points: np.ndarray, index: np.ndarray, chosen: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Mask of the points `index` with one of the `chosen`, of similar normal, within their radius [len(index)]."""
+    if len(index) == 0 or len(chosen) == 0:
+        return np.zeros(len(index), bool)
+    k = min(NEIGHBOURS, len(chosen))
+    _, distance, cosine = _nearest(points[chosen], points[index], k, radius.max())
+    return np.any((distance <= radius[index, None]) & (cosine >= MIN_COSINE), axis=1)
+
+
+def _luby(points: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Mask of a maximal independent set of points of like radii."""
+    pairs = cKDTree(points[:, :3]).query_pairs(radius.max(initial=0), output_type="ndarray")
+    a, b = points[pairs[:, 0]], points[pairs[:, 1]]
+    close = np.linalg.norm(a[:, :3] - b[:, :3], axis=1) <= radius[pairs].min(1)
+    pairs = pairs[close & (np.einsum("ij,ij->i", a[:, 3:], b[:, 3:]) >= MIN_COSINE)]
+    rank = np.random.default_rng(0).permutation(len(points))
+    chosen, undecided = np.zeros(len(points), bool), np.ones(len(points), bool)
     while undecided.any():
         pairs = pairs[undecided[pairs].all(1)]
-        lowest = np.full(len(index), len(index))
+        lowest = np.full(len(points), len(points))
         np.minimum.at(lowest, pairs.ravel(), rank[pairs[:, ::-1]].ravel())
         new = undecided & (rank < lowest)
         chosen |= new
         undecided &= ~new
         undecided[pairs[new[pairs[:, 0]], 1]] = False
         undecided[pairs[new[pairs[:, 1]], 0]] = False
-    return index[chosen]
+    return chosen

@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from olpm_bench.transport.cache import MISSING, _copied
+from olpm_bench.transport.cache import MISSING, copied
 from olpm_bench.transport.guide import MIN_PARTICLES
 from olpm_bench.transport.particles import Departures, ParticleRays, evaluated
 from representations import discrete, square
@@ -91,8 +91,8 @@ class EmissionGuide:
         self.dark = total[:, 0] <= 0
         shares = np.divide(shares, total, out=np.zeros_like(shares), where=total > 0)
         self.power = total[:, 0]                                        # of a block, up to a factor
-        self.share = _copied(mi.Float, shares.ravel().astype(np.float32))
-        self.share_sums = _copied(mi.Float, np.cumsum(shares, 1).ravel().astype(np.float32))
+        self.share = copied(mi.Float, shares.ravel().astype(np.float32))
+        self.share_sums = copied(mi.Float, np.cumsum(shares, 1).ravel().astype(np.float32))
 
     def _radiance(self, d: mi.Vector3f) -> mi.Spectrum:
         """Of the environment, seen along d."""
@@ -141,10 +141,10 @@ class EmissionGuide:
                 self._tabulate_radiance()
             self._aim(new[:3].astype(float), new[3:6].astype(float), np.minimum(new[6], CLAMP * new[6].mean()))
         weight = np.minimum(new[6], CLAMP * new[6].mean())
-        d = mi.Vector3f([_copied(mi.Float, x) for x in new[3:6]])
+        d = mi.Vector3f([copied(mi.Float, x) for x in new[3:6]])
         light = new[7].astype(np.int64)
         block = _cell(d).numpy().astype(np.int64) // BLOCK ** 2
-        wo, inside = self._to_hemisphere(mi.Point3f([_copied(mi.Float, x) for x in new[:3]]), d)
+        wo, inside = self._to_hemisphere(mi.Point3f([copied(mi.Float, x) for x in new[:3]]), d)
         wo = np.stack([x.numpy() for x in wo])
 
         # Each teaches the records of its block, area and zone, or that of its directional light
@@ -164,8 +164,8 @@ class EmissionGuide:
         record = self.records[key[entry]]
         entry %= len(light)
         batch = ParticleBatch.from_arrays(
-            mi.Vector3f([_copied(mi.Float, x) for x in wo[:, entry]]), _copied(mi.Float, weight[entry].astype(np.float32)),
-            _copied(mi.UInt32, record), len(self.seen))
+            mi.Vector3f([copied(mi.Float, x) for x in wo[:, entry]]), copied(mi.Float, weight[entry].astype(np.float32)),
+            copied(mi.UInt32, record), len(self.seen))
         self.state = self.representation.update(self.state, batch, seed)
         self.seen += np.bincount(record, minlength=len(self.seen))
         dr.eval(self.state)
@@ -204,7 +204,7 @@ class EmissionGuide:
         fine_blocks, fine_areas = np.split(seen[records][:N_BLOCKS + N_AREAS] >= FINE, [N_BLOCKS])
         areas = np.where(fine_areas, areas, zones[_parent(np.arange(N_AREAS), AREAS)])
         blocks = np.where(fine_blocks, blocks, areas[_parent(np.arange(N_BLOCKS), BLOCKS)])
-        self.serving = _copied(mi.UInt32, np.concatenate([blocks, lights]).astype(np.uint32))
+        self.serving = copied(mi.UInt32, np.concatenate([blocks, lights]).astype(np.uint32))
         guided = lights != MISSING
         if self.has_environment:
             importance = np.where(self.dark, 0, self.importance)
@@ -214,9 +214,9 @@ class EmissionGuide:
             importance = (1 - SMOOTH) * importance + SMOOTH * spread[area] * self.power
             guided[0] = importance.sum() > 0
             mass = importance / max(importance.sum(), 1e-300)
-            self.mass = _copied(mi.Float, mass.astype(np.float32))
-            self.mass_sums = _copied(mi.Float, np.cumsum(mass).astype(np.float32))
-        self.own_share = _copied(mi.Float, np.where(guided, self.fraction, 1).astype(np.float32))
+            self.mass = copied(mi.Float, mass.astype(np.float32))
+            self.mass_sums = copied(mi.Float, np.cumsum(mass).astype(np.float32))
+        self.own_share = copied(mi.Float, np.where(guided, self.fraction, 1).astype(np.float32))
         self.learnt = True
 
     # ---------------------- Emission ----------------------

@@ -4,10 +4,13 @@ Two ways, both deterministic:
 
 * `binned`: a particle goes to the record that its own look-up finds; of more than `neighbours`, evenly spaced ones
   are kept and stand for the others.  One sort, O(1) a particle.
-* `nearest`: each record takes exactly the `neighbours` nearest particles within its radius, as in the paper [L].
+* `nearest`: each record takes exactly the `neighbours` nearest particles within r_max, as in the paper [L], however small
+  its validity radius.
   Exact to a 2^-24 part of the squared radius; equals are taken in the order of tracing.
 """
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -22,14 +25,24 @@ MIN_COSINE = 0.707          # dot(n', n): and those on surfaces that turn away f
 DIGIT_BITS, DIGITS = 8, 3   # of the squared distances, for selection by radix
 
 
-def binned(cache: RecordCache, particles: Particles, neighbours: int) -> ParticleBatch:
+@dataclass
+class Gathered(ParticleBatch):
+    """What one gather brings to the records.
+
+    extent: validity radius with which a record would get just `neighbours` particles, at most r_max [n_records, scene
+        units]: R_ph.  Of `nearest`, the distance of the farthest [L]; of `binned`, R sqrt(neighbours / found).
+    """
+    extent: mi.Float
+
+
+def binned(cache: RecordCache, particles: Particles, neighbours: int) -> Gathered:
     """The particles that fall to each record, at most `neighbours` a record."""
     p, weight, d, _, n = particles.read(particles.place)
     record, normal, valid = cache.lookup(p, n, weight > 0)
     valid &= dr.dot(d, normal) >= MIN_ELEVATION
     order, record, offset = group(dr.select(valid, record, dr.opaque(mi.UInt32, len(cache))), len(cache))
     if len(order) == 0:
-        return ParticleBatch.empty(len(cache))
+        return _nothing(cache)
     # Of the `found` particles of a record, `kept` evenly spaced ones: where rank * kept steps over a multiple of found.
     found = dr.maximum(dr.gather(mi.UInt32, offset, record + 1) - dr.gather(mi.UInt32, offset, record), 1)
     kept = dr.minimum(found, dr.opaque(mi.UInt32, neighbours))
@@ -37,11 +50,14 @@ def binned(cache: RecordCache, particles: Particles, neighbours: int) -> Particl
     chosen = dr.compress(rank * kept % found < kept)
     stands_for = dr.gather(mi.Float, mi.Float(found) / mi.Float(kept), chosen)
     place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, order, chosen))
-    return _batch(cache, particles, place, dr.gather(mi.UInt32, record, chosen), stands_for)
+    i, wanted = dr.arange(mi.UInt32, len(cache)), dr.opaque(mi.Float, neighbours)
+    found = dr.maximum(dr.gather(mi.UInt32, offset, i + 1) - dr.gather(mi.UInt32, offset, i), 1)
+    extent = cache.row(i)[3] * dr.sqrt(wanted / mi.Float(found))
+    return _batch(cache, particles, place, dr.gather(mi.UInt32, record, chosen), stands_for, extent)
 
 
-def nearest(cache: RecordCache, particles: Particles, neighbours: int) -> ParticleBatch:
-    """Exactly the `neighbours` nearest particles of each record, within its radius."""
+def nearest(cache: RecordCache, particles: Particles, neighbours: int) -> Gathered:
+    """Exactly the `neighbours` nearest particles of each record within r_max."""
     candidates = _Candidates(cache, particles)
     # The squared distance of the last neighbour, digit by digit from the highest: counters tell which digit holds it.
     last, wanted = dr.zeros(mi.UInt32, len(cache)), dr.full(mi.UInt32, neighbours, len(cache))
@@ -52,11 +68,12 @@ def nearest(cache: RecordCache, particles: Particles, neighbours: int) -> Partic
         dr.eval(last, wanted)
     hit, record = candidates.take(last, wanted, neighbours)
     if len(hit) == 0:
-        return ParticleBatch.empty(len(cache))
+        return _nothing(cache)
+    extent = dr.sqrt((mi.Float(last) + 1) / candidates.to_key)          # r_max where there are not as many
     by_path = dr.argsort(hit)               # not by voxel: see Particles
     order, record, _ = group(dr.gather(mi.UInt32, record, by_path), len(cache))
     place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, hit, dr.gather(mi.UInt32, by_path, order)))
-    return _batch(cache, particles, place, record, mi.Float(1))
+    return _batch(cache, particles, place, record, mi.Float(1), extent)
 
 
 def by_record(cache: RecordCache, particles: Particles) -> tuple[mi.UInt32, mi.UInt32]:
@@ -70,7 +87,12 @@ def by_record(cache: RecordCache, particles: Particles) -> tuple[mi.UInt32, mi.U
 GATHERS = {"binned": binned, "nearest": nearest}
 
 
-def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: mi.UInt32, stands_for: mi.Float) -> ParticleBatch:
+def _nothing(cache: RecordCache) -> Gathered:
+    return Gathered(**vars(ParticleBatch.empty(len(cache))), extent=dr.full(mi.Float, cache.radius, len(cache)))
+
+
+def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: mi.UInt32, stands_for: mi.Float,
+           extent: mi.Float) -> Gathered:
     """A batch of chosen particles, already grouped by record, with directions in the records' frames.
 
     Raises:
@@ -78,7 +100,8 @@ def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: m
     """
     _, weight, d, distance, _ = particles.read(place)
     frame = mi.Frame3f(cache.row(record)[1])
-    batch = ParticleBatch(frame.to_local(d), weight * stands_for, distance, record, offsets(record, len(cache)))
+    batch = Gathered(frame.to_local(d), weight * stands_for, distance, record, offsets(record, len(cache)),
+                     dr.minimum(extent, dr.opaque(mi.Float, cache.radius)))
     finite = dr.all(dr.isfinite(batch.weight))
     dr.eval(batch, finite)
     if not finite:
@@ -100,7 +123,7 @@ class _Candidates:
         self.hit = order
         self.p, self.d, self.n = (dr.gather(type(v), v, order) for v in (p, d, n))
         self.grid, self.n_records = grid, len(cache)
-        self.record_p, self.record_n, _ = cache.row(dr.arange(mi.UInt32, len(cache)))
+        self.record_p, self.record_n, _, _ = cache.row(dr.arange(mi.UInt32, len(cache)))
         self.to_key = dr.opaque(mi.Float, 2 ** (DIGIT_BITS * DIGITS) / cache.radius ** 2)
         dr.eval(self.offset, self.hit, self.p, self.d, self.n, self.record_p, self.record_n)
 

@@ -3,22 +3,27 @@ from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 import representations
-from olpm_bench.transport.cache import RecordCache
+from olpm_bench.transport import radius
+from olpm_bench.transport.cache import RecordCache, copied
 from olpm_bench.transport.estimates import Estimates
 from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.settings import InputError
 from representations import state as states
 from representations.interface import ParticleBatch
 
-FORMAT = 2              # of guide files
+if TYPE_CHECKING:
+    from olpm_bench.transport.gather import Gathered
+
+FORMAT = 3              # of guide files
 MIN_PARTICLES = 80      # records that have seen fewer leave the surface to its BSDF; the mixture's first fit needs as many
 
 
@@ -60,11 +65,12 @@ class Guide:
         self.cache, self.specification, self.fraction = cache, specification, fraction
         self.representation = representations.create(**specification)
         self.state = self.representation.init(0)
-        self.count = dr.zeros(mi.UInt32, 0)     # particles seen by each record
+        self.count = dr.zeros(mi.UInt32, 0)     # particles seen by each record, or by the one that it began as a copy of
         self.estimates = Estimates.nothing(0)
         self.rows = mi.Float()                  # [n_records * 4] for queries: has seen enough, fraction, outgoing; unused
         self.pixels: PixelEstimate | None = None        # of the camera that the guide was trained for
         self.particles = 0                      # particles stored over all passes
+        self.wanted = np.zeros(0, np.float32)   # radii that the last measured batch asks for [scene units]
 
     @property
     def records(self) -> int:
@@ -88,14 +94,27 @@ class Guide:
     # ---------------------- Learning ----------------------
 
     def grow(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, seed: int) -> None:
-        """Add untrained records where the points have none."""
-        added = self.cache.grow(p, n, active)
+        """Add records where the points have none: what the record beside them has learnt, if it has the same frame."""
+        before, added = self.records, self.cache.grow(p, n, active)
         if added:
             self.state = states.append(self.state, self.representation.init(added, seed))
             self.count = states.join(self.count, dr.zeros(mi.UInt32, added))
             self.estimates = states.append(self.estimates, Estimates.nothing(added))
+            self._inherit(before)
             dr.eval(self.state, self.count, self.estimates)
             self._tabulate()
+
+    def _inherit(self, first: int) -> None:
+        """Copy to the records from number `first` on what the older ones beside them have learnt, and their count."""
+        parent = self.cache.parents(first)
+        child = np.flatnonzero(parent >= 0)
+        if len(child) < 2:                      # a single one stays untrained: arrays of one entry compile other kernels
+            return
+        source, target = (copied(mi.UInt32, x.astype(np.uint32)) for x in (parent[child], first + child))
+        self.count = states.copy_records(self.count, self.records, source, target)
+        for state in (self.state, self.estimates):
+            for f in fields(state):
+                setattr(state, f.name, states.copy_records(getattr(state, f.name), self.records, source, target))
 
     def learn_particles(self, batch: ParticleBatch, seed: int, emitted: int = 1) -> None:
         """One on-line update with the photons or importons of one pass, of which so many were `emitted`."""
@@ -134,7 +153,15 @@ class Guide:
 
     def areas(self) -> mi.Float:
         """Area from which each record takes its particles, up to a factor [scene units^2]."""
-        return dr.opaque(mi.Float, self.cache.radius ** 2)
+        return copied(mi.Float, self.cache.radii ** 2)
+
+    def measure(self, batch: Gathered) -> None:
+        """Note the validity radii that a batch asks for."""
+        self.wanted = radius.wanted(self.cache, batch)
+
+    def shrink(self) -> None:
+        """Shrink the records to the radii noted last: before the cache grows, so that gaps are filled at once."""
+        self.cache.shrink(self.wanted)
 
     # ---------------------- Files ----------------------
 
@@ -165,10 +192,8 @@ class Guide:
             with np.load(path, allow_pickle=False) as file:
                 arrays = dict(file)
             meta = json.loads(str(arrays["meta"]))
-            if meta["format"] > FORMAT:
-                raise InputError(f"{path}: guide format {meta['format']} is newer than this version's ({FORMAT})")
-            if meta["format"] < FORMAT:
-                raise InputError(f"{path}: guide format {meta['format']} is of an older version (now {FORMAT}); train it anew")
+            if meta["format"] != FORMAT:
+                raise InputError(f"{path}: guide format {meta['format']}, this version reads {FORMAT}; train again")
             guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"], meta["fraction"])
             guide.state = states.from_numpy(guide.state, part("state."))
             guide.estimates = states.from_numpy(guide.estimates, part("estimates."))

@@ -76,7 +76,9 @@ class TrainingSettings:
     gather: "binned": the particles whose look-up gives the record, at most `neighbours` of them;
         "nearest": exactly the `neighbours` nearest within the record radius, as in the paper.  (Camera paths are binned.)
     neighbours: particles of a pass used by a record [L: 250].
-    record_radius: validity radius of a record, in units of the scene's diagonal [L: 0.01].
+    record_radius: largest validity radius of a record, in units of the scene's diagonal [L: 0.01].
+    shrink: records shrink from there, to a tenth at most, where particles are dense, sources near or lobes sharp, as in the
+        paper; off by default: at equal time it costs more than it gains.
     fraction: probability of sampling the BSDF rather than the guide when particles scatter.
     learn_fraction: learn it from camera paths, record by record, for camera paths and importons.
     emission: "guided" starts photons of lights at infinity (constant, envmap, sunsky, directional) where importons leave for
@@ -98,6 +100,7 @@ class TrainingSettings:
     gather: Literal["binned", "nearest"] = "binned"
     neighbours: int = 250
     record_radius: float = 0.02
+    shrink: bool = False
     fraction: float = 0.5
     learn_fraction: bool = True
     emission: Literal["guided", "emitter"] = "guided"
@@ -126,7 +129,7 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
 
 
 # The talk's particles, gather and schedule [T, L]: photons and importons only, a fixed fraction.
-_PAPER = {"gather": "nearest", "record_radius": 0.01, "passes": 10, "importons": 300_000, "camera_passes": 0,
+_PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "importons": 300_000, "camera_passes": 0,
           "learn_fraction": False, "window": "flux"}
 
 # What each preset changes of the defaults, which are those of `best`.

@@ -216,11 +216,15 @@ class Training:
             return 0
         with _Seconds(statistics, "grow"):
             p, weight, _, _, n = particles.read(particles.place)
+            if self.settings.shrink:
+                guide.shrink()
             guide.grow(p, n, weight > 0, self._next_seed())
         with _Seconds(statistics, "gather"):
             batch = GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours)
         with _Seconds(statistics, "update"):
             guide.learn_particles(batch, self._next_seed(), emitted)
+            if self.settings.shrink:
+                guide.measure(batch)
         return len(batch)
 
     def _camera_pass(self, statistics: PassStatistics) -> PassStatistics:

@@ -43,7 +43,7 @@ def by_contribution(guide: Guide, own: Guide, hits: float, least: mi.Float) -> W
         hits: how many hits a particle shall leave on average.
         least: [1] flux [per emitted particle] of one particle of a pass: a record of no fluence may have missed so much.
     """
-    p, n, _ = guide.cache.row(dr.arange(mi.UInt32, guide.records))
+    p, n, *_ = guide.cache.row(dr.arange(mi.UInt32, guide.records))
     fluence = dr.maximum(own.fluence_at(p, n), least / guide.areas())
     density = (guide.estimates.fluence * fluence) ** EXPONENT
     window = Window(density / fluence, dr.sum(density * guide.areas()) / dr.opaque(mi.Float, hits))

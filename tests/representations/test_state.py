@@ -10,7 +10,7 @@ import pytest
 from conformance import batch, lobes, states_equal
 
 import representations
-from representations.state import append, bytes_of, from_numpy, to_numpy
+from representations.state import append, bytes_of, copy_records, from_numpy, to_numpy
 
 
 @dataclass
@@ -55,3 +55,10 @@ def test_every_representation_has_such_a_state(name: str) -> None:
     arrays = to_numpy(state)
     assert all(a.ndim == 1 and len(a) % 3 == 0 for a in arrays.values())
     assert states_equal(from_numpy(representation.init(1), {k: a.copy() for k, a in arrays.items()}), state)
+
+
+def test_records_are_copied():
+    array = mi.Float(np.arange(12, dtype=np.float32))           # four records of three
+    new = copy_records(array, 4, mi.UInt32([0, 0]), mi.UInt32([1, 3]))
+    np.testing.assert_array_equal(new.numpy(), [0, 1, 2, 0, 1, 2, 6, 7, 8, 0, 1, 2])
+    np.testing.assert_array_equal(array.numpy(), np.arange(12))

@@ -77,6 +77,21 @@ def test_directions_are_in_the_frame_of_the_record(landed, gather):
     assert len(batch.offset) == len(cache) + 1 and batch.offset.numpy()[-1] == len(batch)
 
 
+def test_extent_is_the_radius_that_would_hold_the_neighbours(landed):
+    """`nearest`: the farthest used, r_max with too few; `binned`: by the number found."""
+    cache, particles = landed
+    batch = nearest(cache, particles, 100)
+    record, count = batch.record.numpy(), batch.count().numpy()
+    extent = batch.extent.numpy()
+    np.testing.assert_allclose(extent[count < 100], cache.radius, rtol=1e-5)
+    assert (extent[count == 100] <= cache.radius * 1.00001).all() and (extent < 0.9 * cache.radius).any()
+    more = nearest(cache, particles, 200).extent.numpy()
+    assert (more >= extent).all() and len(record) == count.sum()
+    found = binned(cache, particles, 10 ** 6).count().numpy()
+    np.testing.assert_allclose(binned(cache, particles, 100).extent.numpy(),
+                               cache.radius * np.minimum(np.sqrt(100 / np.maximum(found, 1)), 1), rtol=1e-4)
+
+
 @pytest.mark.parametrize("gather", [binned, nearest])
 def test_same_particles_same_batch(landed, gather):
     cache, particles = landed

@@ -18,6 +18,7 @@ from representations import state as states
 
 SMALL = settings.training(passes=3, photons=20_000, importons=10_000, record_radius=0.08, camera_passes=2, camera_paths=2 ** 14)
 PARTICLES = dataclasses.replace(SMALL, camera_passes=0)
+SHRINKING = {"shrink": True, "neighbours": 80}
 DEPTH = 6
 PATHS = settings.integrator(max_depth=DEPTH)
 
@@ -28,7 +29,7 @@ def scene() -> mi.Scene:
 
 
 def _arrays(guide: Guide) -> dict[str, np.ndarray]:
-    return states.to_numpy(guide.state) | {"points": guide.cache.points, "count": guide.count.numpy()}
+    return states.to_numpy(guide.state) | {"points": guide.cache.points, "radii": guide.cache.radii, "count": guide.count.numpy()}
 
 
 @pytest.mark.parametrize("name", representations.names())
@@ -43,14 +44,14 @@ def test_guides_learn_on_line(scene, name):
     assert np.mean(guide.count.numpy() >= 40) > 0.8
 
 
-@pytest.mark.parametrize("name", ["jensen", "gaussian_mixture"])
-def test_training_repeats_bit_for_bit_whatever_the_threads(scene, name):
+@pytest.mark.parametrize(("name", "changes"), [("jensen", {}), ("gaussian_mixture", {}), ("gaussian_mixture", SHRINKING)])
+def test_training_repeats_bit_for_bit_whatever_the_threads(scene, name, changes):
     threads = dr.thread_count()
     try:
         results = []
         for count in (1, 2):
             dr.set_thread_count(count)
-            results.append(_arrays(train(scene, name, SMALL, PATHS, seed=4)))
+            results.append(_arrays(train(scene, name, settings.with_changes(SMALL, changes), PATHS, seed=4)))
     finally:
         dr.set_thread_count(threads)
     for key, value in results[0].items():
@@ -62,13 +63,14 @@ def test_seeds_differ(scene):
     assert a.records != b.records or not np.array_equal(a.cache.points, b.cache.points)
 
 
-@pytest.mark.parametrize("name", ["jensen", "hey", "gaussian_mixture"])
-def test_no_kernel_is_compiled_after_warm_up(scene, name):
+@pytest.mark.parametrize(("name", "changes"), [("jensen", {}), ("hey", {}), ("gaussian_mixture", {}),
+                                               ("gaussian_mixture", SHRINKING)])
+def test_no_kernel_is_compiled_after_warm_up(scene, name, changes):
     """Counts, seeds, sizes and pass numbers are data, not code.
 
     One exception is let pass: in about one run of six with an empty kernel cache, Dr.Jit gave the trace's loop a second form.
     """
-    many = settings.with_changes(SMALL, {"passes": 6, "camera_passes": 5})
+    many = settings.with_changes(SMALL, {"passes": 6, "camera_passes": 5, **changes})
     train(scene, name, many, PATHS)
     passes = Training(scene, name, many, PATHS, seed=1).run()
     for _ in range(3):
@@ -82,6 +84,22 @@ def test_no_kernel_is_compiled_after_warm_up(scene, name):
     assert len([k["size"] for k in history if not k["cache_hit"]]) <= 1
 
 
+@pytest.mark.parametrize("gather", ["binned", "nearest"])
+def test_shrinking_records_saturate(scene, gather):
+    """Fewer and fewer records are added, none smaller than what fills it, and all surfaces stay guided."""
+    shrinking = settings.with_changes(PARTICLES, {"passes": 12, "gather": gather, **SHRINKING})
+    training = Training(scene, "jensen", shrinking, PATHS)
+    records, radii = [], np.zeros(0)
+    for _ in training.run():
+        cache = training.radiance.cache
+        assert (cache.radii[:len(radii)] <= radii).all()
+        records.append(len(cache))
+        radii = cache.radii.copy()
+    added = np.diff(records)
+    assert added[-4:].mean() < 0.25 * added[:3].mean() and records[-1] > 1.3 * records[0]
+    assert radii.min() < 0.8 * cache.radius and training.radiance.trained > 0.9
+
+
 def test_memory_is_constant(scene):
     """The state is as large after many passes as after two: nothing of the particles stays."""
     training = Training(scene, "gaussian_mixture", settings.with_changes(SMALL, {"passes": 6, "camera_passes": 6}), PATHS)
@@ -89,7 +107,7 @@ def test_memory_is_constant(scene):
     for _ in training.run():
         size.append(states.bytes_of(training.radiance.state) / training.radiance.records)
     assert size[-1] == pytest.approx(size[1], rel=1e-6)
-    assert training.radiance.records < 1.02 * training.radiance.cache.cells.size
+    assert training.radiance.records < 1.02 * len(training.radiance.cache.cells)
 
 
 def test_single_batch_is_one_unguided_fit(scene):
