@@ -28,6 +28,7 @@ ResultsFolder = Annotated[Path, typer.Option(
     "--results", metavar="DIR", help="Results go to DIR/<stem of the TOML>, references to DIR/references.")]
 Replacements = Annotated[list[str], typer.Option(
     "--scene", metavar="NAME=PATH", help="Read the scene NAME of the experiment from another XML.")]
+Only = Annotated[list[str], typer.Option("--only-scene", metavar="NAME", help="Leave the other scenes for later.")]
 Assignments = Annotated[list[str], typer.Option(
     "--set", metavar="TABLE.KEY=VALUE", help="Change a setting; keys as in the TOML.")]
 
@@ -91,6 +92,7 @@ def _load(path: Path, replacements: list[str] | None = None) -> Any:
 
 @command
 def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
+        only: Only = [],  # noqa: B006
         dry_run: Annotated[bool, typer.Option("--dry-run", help="Print cells, hours and memory; run nothing.")] = False,
         ) -> None:
     """Run an experiment, or what is missing of it; then print its table and draw its figures."""
@@ -101,20 +103,20 @@ def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), sc
     from olpm_bench.bench import run as runner
 
     if dry_run:
-        plan = runner.plan(loaded, results)
+        plan = runner.plan(loaded.of_scenes(only), results)
         hours = "unknown" if plan["hours"] is None else f"{plan['hours']:.2f}, and compilation"
         for spec in plan["cells"]:
             print(f"{spec}{'' if spec in plan['todo'] else '  (complete)'}")
         print(f"{len(plan['todo'])} of {len(plan['cells'])} cells to run; hours: {hours}; "
               f"memory: about {plan['gigabytes']:.1f} GB")
         return
-    problems = runner.run(loaded, results)
+    problems = runner.run(loaded, results, only)
     if problems:
         for problem in problems:
             complain(problem)
-        complain(f"{len(problems)} of {len(loaded.cells())} cells are not complete; no table and no figures")
+        complain(f"{len(problems)} of {len(loaded.of_scenes(only).cells())} cells are not complete; no table and no figures")
         raise typer.Exit(FAILED)
-    runner.report(loaded, results)
+    runner.report(loaded, results, only)
 
 
 @command

@@ -16,7 +16,7 @@ import math
 import os
 import shlex
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from olpm_bench.bench.results import SCHEMA_VERSION, slug
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, preset_of, with_changes
 
 MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see run.pass_seed
+NO_REFERENCE = Path("none")
 
 
 class ConfigError(InputError):
@@ -72,7 +73,8 @@ class Scene(Table):
     parameters: of the embedded scene.
     overrides: of the XML's own ``<default>`` values.
     max_depth: wins over the integrator's.
-    reference: a reference folder, or an EXR of another renderer; by default it is found by the scene's key.
+    reference: a reference folder, or an EXR of another renderer; by default it is found by the scene's key.  "none": do
+        without, and so without errors and speed-ups; variance, gains and means need none.
     """
     name: str = Field(min_length=1)
     file: Path | None = Field(None, strict=False)
@@ -89,6 +91,11 @@ class Scene(Table):
         if value is not None and value < 1 and value != -1:
             raise ValueError("must be >= 1, or -1 for no limit")
         return value
+
+    @property
+    def has_reference(self) -> bool:
+        """Errors can be measured, once the reference is made."""
+        return self.reference != NO_REFERENCE
 
     @property
     def source(self) -> str:
@@ -182,11 +189,15 @@ class CellSpec:
 
 
 class Experiment(Table):
-    """A whole experiment file.  `seeds = 3` means seeds 0, 1, 2."""
+    """A whole experiment file.  `seeds = 3` means seeds 0, 1, 2.
+
+    baseline: the method that gains and speed-ups are over; the first by default.
+    """
     schema_version: int = SCHEMA_VERSION
     title: str
     description: str = ""
     seeds: list[int] = [0]
+    baseline: str | None = None
     budget: Budget
     scene: list[Scene] = Field(min_length=1)
     integrator: IntegratorSettings = IntegratorSettings()
@@ -238,11 +249,18 @@ class Experiment(Table):
                 if other != name:
                     raise ValueError(f"{kind} {other!r} and {name!r} would share the folder '{slug(name)}'; names must "
                                      "differ")
+        if self.baseline_name not in (known := [m.name for m in self.method]):
+            raise ValueError(f"baseline = {self.baseline!r}: no method of this name; known: {', '.join(known)}")
         for method in self.method:
             self.training_of(method)
             for scene in self.scene:
                 self.integrator_of(scene, method)
         return self
+
+    @property
+    def baseline_name(self) -> str:
+        """The method that the others are compared with."""
+        return self.method[0].name if self.baseline is None else self.baseline
 
     def integrator_of(self, scene: Scene, method: Method) -> IntegratorSettings:
         changes = dict(method.integrator)
@@ -268,6 +286,18 @@ class Experiment(Table):
         return [CellSpec(scene, method, seed, self.integrator_of(scene, method), self.training_of(method), self.budget)
                 for scene in self.scene for seed in self.seeds for method in self.method]
 
+    def of_scenes(self, names: Sequence[str]) -> Experiment:
+        """The experiment with some of its scenes only; with all of them if none is named.
+
+        Raises:
+            ConfigError: no scene of that name.
+        """
+        known = [scene.name for scene in self.scene]
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"no scene {name!r} in {self.path.name}; known: {', '.join(known)}")
+        return self.model_copy(update={"scene": [scene for scene in self.scene if not names or scene.name in names]})
+
     def reference_key(self, scene: Scene) -> str:
         return reference_key(scene, self.max_depth(scene))
 
@@ -289,7 +319,7 @@ class Experiment(Table):
             else:
                 table |= {"file": path(scene.file), "overrides": scene.overrides}
             if scene.reference is not None:
-                table["reference"] = path(scene.reference)
+                table["reference"] = path(scene.reference) if scene.has_reference else str(NO_REFERENCE)
             scenes.append(table)
         for method in self.method:
             table, training = {"name": method.name}, self.training_of(method)
@@ -305,8 +335,9 @@ class Experiment(Table):
             methods.append(table)
         return {
             "schema_version": SCHEMA_VERSION, "title": self.title, "description": self.description, "seeds": self.seeds,
-            "budget": self.budget.model_dump(exclude_none=True), "integrator": dataclasses.asdict(self.integrator),
-            "training": dataclasses.asdict(self.training), "scene": scenes, "method": methods}
+            "baseline": self.baseline_name, "budget": self.budget.model_dump(exclude_none=True),
+            "integrator": dataclasses.asdict(self.integrator), "training": dataclasses.asdict(self.training),
+            "scene": scenes, "method": methods}
 
     def toml(self, relative_to: Path | None = None) -> str:
         """`resolved` as TOML; reading it back gives the same cells."""
@@ -416,7 +447,7 @@ def _without_paths(data: dict[str, Any], folder: Path) -> dict[str, Any]:
     data = json.loads(json.dumps(data, default=str))
     for scene in _tables(data.get("scene")):
         for key in ("file", "reference"):
-            if isinstance(scene.get(key), str):
+            if isinstance(scene.get(key), str) and (key, scene[key]) != ("reference", str(NO_REFERENCE)):
                 scene[key] = str((folder / scene[key]).resolve())
     for method in _tables(data.get("method")):
         representation = method.get("representation")
@@ -458,8 +489,8 @@ def _check_scene(scene: Scene, source: str, replaceable: bool) -> None:
             embedded.resolve(scene.name, scene.parameters)
         except embedded.SceneError as error:
             raise ConfigError(f"{where}: {error}") from None
-    if scene.reference is not None and not scene.reference.exists():
-        raise ConfigError(f"{where}: reference {scene.reference}: there is no such file or folder")
+    if scene.reference is not None and scene.has_reference and not scene.reference.exists():
+        raise ConfigError(f"{where}: reference {scene.reference}: there is no such file or folder; \"none\" does without")
 
 
 TABLES = {"budget": Budget, "scene": Scene, "method": Method,
@@ -471,7 +502,7 @@ UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 def _explain(error: ValidationError, source: str) -> str:
     """The first mistake that pydantic found, in one line."""
-    first = min(error.errors(), key=lambda e: e["type"] not in UNKNOWN)      # a misspelt key is missing, too
+    first: Any = min(error.errors(), key=lambda e: e["type"] not in UNKNOWN)      # a misspelt key is missing, too
     parts = list(first["loc"])
     table = parts[0] if parts and parts[0] in TABLES else None
     cls: Any = TABLES.get(str(table), Experiment)
@@ -491,6 +522,10 @@ def _explain(error: ValidationError, source: str) -> str:
         return f"missing key '{keys[-1]}' in {where}" if keys else f"missing table '{table}' in {source}"
     if not keys and table is not None and not isinstance(first["input"], dict):     # the table itself is none
         where, keys = source, [where.removeprefix(source).strip()]
+    if keys and keys[-1] == "float":             # the first of several types: pydantic tells them apart in the path
+        literal = next((e for e in error.errors() if e["loc"][:-1] == first["loc"][:-1] and e["type"] == "literal_error"), None)
+        keys = keys[:-1]
+        first = {**first, "msg": first["msg"] + (f" or {literal['ctx']['expected']}" if literal else "")}
     name = ".".join(str(k) for k in keys)
     return f"{where}: {name + ' ' if name else ''}{_plain(first)}"
 

@@ -110,12 +110,16 @@ def work_normalised_variance(images: Sequence[np.ndarray], seconds: float) -> fl
     Returns:
         NaN where it has no value: a single seed, or black images.
     """
-    if len(images) < 2:
+    return relative_variance(np.stack([luminance(image) for image in images])) * seconds
+
+
+def relative_variance(Y: np.ndarray) -> float:
+    """Median over pixels of var / (mean^2 + 1e-3 imagemean^2), of luminances (seeds, h, w); NaN as above."""
+    if len(Y) < 2:
         return float("nan")
-    Y = np.stack([luminance(image) for image in images])
     mean = Y.mean(axis=0)
     with np.errstate(invalid="ignore"):
-        return float(np.median(Y.var(axis=0, ddof=1) / (mean**2 + 1e-3 * mean.mean() ** 2)) * seconds)
+        return float(np.median(Y.var(axis=0, ddof=1) / (mean**2 + 1e-3 * mean.mean() ** 2)))
 
 
 METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {

@@ -26,6 +26,7 @@ from representations.interface import ParticleBatch
 REPEATS = 5
 MAX_DEPTH = 13
 PARTICLES: dict[str, Any] = {"photons": 300_000, "importons": 100_000}      # of a training pass
+CAMERA_PATHS = 2 ** 17
 RECORDS, EACH = 4096, 256                                   # of the on-line update: records, particles of each
 
 
@@ -35,14 +36,17 @@ def measure(scene: str = "door_ajar", width: int = 160, height: int = 90, spp: i
     Args:
         scene: embedded name or Mitsuba XML on which vertices and training passes are timed.
         spp: samples a pixel of the timed renders.
-        passes: training passes with the mixture, of `PARTICLES`; at least 3, timed from the third on.
+        passes: training passes with the mixture, of `PARTICLES` and of `CAMERA_PATHS`; at least 3, timed from the third on.
     """
     loaded = load(scene, width=width, height=height, max_depth=MAX_DEPTH)
     figures: dict[str, Any] = {"scene": scene, "width": width, "height": height, "em_ns_per_particle": em_ns_per_particle()}
-    training_passes(loaded, 4, "binned")            # compiles what can be: also what only passes without new records do
-    guide, seconds, misses, rss = training_passes(loaded, passes, "binned")
+    training_passes(loaded, 4)                      # compiles what can be: also what only passes without new records do
+    guide, seconds, misses, rss = training_passes(loaded, passes)
     figures |= {"pass_seconds": seconds, "recompiles_after_warmup": misses, "rss_mb_by_pass": rss}
-    figures["pass_seconds_nearest"] = training_passes(loaded, min(passes, 5), "nearest")[1]
+    figures["pass_seconds_nearest"] = training_passes(loaded, min(passes, 5), gather="nearest")[1]
+    training_passes(loaded, 1, 4)
+    _, seconds, misses, rss = training_passes(loaded, 1, passes)
+    figures |= {"camera_pass_seconds": seconds, "camera_recompiles_after_warmup": misses, "camera_rss_mb_by_pass": rss}
     guides: dict[str, Guide | None] = {"unguided": None, "gaussian_mixture": guide}
     for name in representations.names():
         if name not in guides:
@@ -79,19 +83,24 @@ def em_ns_per_particle() -> float:
     return float(np.median([_cpu_seconds(update) for _ in range(REPEATS)])) / len(batch) * 1e9
 
 
-def training_passes(scene: mi.Scene, passes: int, gather: str) -> tuple[Guide, dict[str, float], int, list[float]]:
-    """Train a mixture: the guide, median wall seconds of a pass by part, kernels compiled after pass 2, memory by pass."""
-    training = Training(scene, "gaussian_mixture", options.training(passes=passes, camera_passes=0, gather=gather, **PARTICLES),
-                        options.integrator(max_depth=MAX_DEPTH))
-    seconds, rss, warm_up = [], [], 0
+def training_passes(scene: mi.Scene, passes: int, camera_passes: int = 0,
+                    gather: str = "binned") -> tuple[Guide, dict[str, float], int, list[float]]:
+    """Train a mixture: the guide, median wall seconds of a pass by part, kernels compiled after pass 2, memory by pass.
+
+    With camera passes these are timed, and not the particle passes before them.
+    """
+    settings = options.training(passes=passes, camera_passes=camera_passes, camera_paths=CAMERA_PATHS, gather=gather, **PARTICLES)
+    training = Training(scene, "gaussian_mixture", settings, options.integrator(max_depth=MAX_DEPTH))
+    seconds, rss, warm_up, first = [], [], 0, passes if camera_passes else 0
     with Kernels.watched() as kernels:
         for statistics in training.run():
             kernels.compiled()
-            if statistics.index < 2:
+            if statistics.index < first + 2:
                 warm_up = kernels.count
             else:
                 seconds.append(statistics.seconds)
-            rss.append(psutil.Process().memory_info().rss / 2 ** 20)
+            if statistics.index >= first:
+                rss.append(psutil.Process().memory_info().rss / 2 ** 20)
     median = {part: float(np.median([s[part] for s in seconds])) for part in seconds[0]}
     median["total"] = float(np.median([sum(s.values()) for s in seconds]))
     return training.radiance, median, kernels.count - warm_up, rss

@@ -9,11 +9,12 @@ from __future__ import annotations
 import dataclasses
 import math
 import shlex
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -43,8 +44,10 @@ from olpm_bench.transport.training import PassStatistics, Training, train
 PASSES = 40                 # rendering passes in a budget, at least: so it is met within 1/40
 SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
 MAX_LANES = 2**24           # paths in flight: about 2 GB
+REPEATS = 3                 # timings of a pass in the warm-up: the shortest counts, a single one may be ten times as long
 WARM_UP_PATHS = 20_000      # photons and importons of the training that compiles the kernels
 
+HALF_LEARNT = 1500          # particles of a record with which its guide leaves twice the variance that it can come down to
 TRAINED = 0.5               # share of trained records below which a guide is reported: most paths are then unguided
 
 # 32-bit seeds of rendering passes: cells from 0, warm-up from 2^30, reference halves from 2^31 and 3 * 2^30.
@@ -128,11 +131,14 @@ def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> Warm
             render_pass(scene, integrator, WARM_UP_SEED, spp)
         kernels.compiled()
         while True:
-            clock = Clock(count_wait=environment.uses_llvm())
-            with clock.lap("render", kernels.compiled):
-                render_pass(scene, integrator, WARM_UP_SEED, spp)
-            if clock.charged > SHORTEST_PASS / 4 or 4 * spp > largest_pass(spec):
-                return WarmUp(kernels.seconds, max(clock.charged, 1e-6) / spp)
+            times = []
+            for _ in range(REPEATS):
+                clock = Clock(count_wait=environment.uses_llvm())
+                with clock.lap("render", kernels.compiled):
+                    render_pass(scene, integrator, WARM_UP_SEED, spp)
+                times.append(clock.charged)
+            if min(times) > SHORTEST_PASS / 4 or 4 * spp > largest_pass(spec):
+                return WarmUp(kernels.seconds, max(min(times), 1e-6) / spp)
             spp *= 4
 
 
@@ -193,16 +199,20 @@ class _Cell:
     def train(self, training: Training) -> Iterator[PassStatistics]:
         """Training passes, until all are done or their share of a budget in seconds is spent."""
         settings, seconds = training.settings, self.spec.budget.seconds
-        end = settings.share * seconds if seconds is not None else math.inf
-        passes = training.run()
-        while self.clock.charged < end:
+        passes, seen = training.run(), 0.0
+        while self.clock.charged < (end := end_of_training(settings.share, seconds, self.clock.charged, seen)):
             late = self.clock.charged >= end / 2 if seconds is not None else 2 * len(self.training) >= training.passes
             if (statistics := self._learn(lambda: next(passes, None), late and settings.blend)) is None:
                 break
+            seen = statistics.seen or seen
             yield statistics
 
+    def has_room(self, spp: int) -> bool:
+        """Whether so many samples a pixel stay within a budget in samples."""
+        return self.spec.budget.spp is None or self.image.spp + spp <= self.spec.budget.spp
+
     def render_and_learn(self, training: Training) -> None:
-        """A rendering pass from which the guide goes on learning."""
+        """A rendering pass from which the guide goes on learning; there must be room for it."""
         self._learn(training.camera_pass, True)
 
     def render(self, scene: mi.Scene, integrator: mi.Integrator, spp: int) -> None:
@@ -222,10 +232,9 @@ class _Cell:
         if statistics is None:
             return None
         self.training.append(statistics.as_dict())
-        room = self.spec.budget.spp is None or self.image.spp + statistics.spp <= self.spec.budget.spp
-        if statistics.image is not None and enters and room:
+        if statistics.image is not None and enters and self.has_room(statistics.spp):
             taken = self.clock["train"].charged
-            self.clock.move((taken - before) / taken * statistics.share("trace"), "train", "render")
+            self.clock.move((taken - before) / max(taken, 1e-9) * statistics.share("trace"), "train", "render")
             self._add(statistics.image, statistics.spp, f"training pass {statistics.index + 1}")
         return statistics
 
@@ -275,7 +284,7 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
                 on_progress(min(1.0, cell.spent), f"training pass {statistics.index + 1} of {statistics.passes} at most")
         integrator = make_integrator(spec, guide)
         while cell.spent < 1 or cell.image.passes == 0:
-            if training is not None and training.settings.while_rendering:
+            if training is not None and training.settings.while_rendering and cell.has_room(training.camera_spp):
                 cell.render_and_learn(training)
             else:
                 cell.render(scene, integrator, spp)
@@ -297,6 +306,28 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
     h, w, _ = image.mean.shape
     layers = {"mean": image.mean, "variance": image.variance(), "count": np.full((h, w), image.spp, np.float32)}
     return Measurement(info, cell.trace, {k: v.astype(np.float32) for k, v in layers.items()}, cell.checkpoints, guide)
+
+
+def end_of_training(share: float | Literal["auto"], seconds: float | None, spent: float, seen: float) -> float:
+    """Charged seconds at which training ends; never, for a budget in samples.
+
+    For "auto", records that have seen n particles are taken to guide with a variance V ~ 1 + HALF_LEARNT / n.  With n in
+    proportion to the time t of training that is 1 + X / t, and V / (T - t) is least at  t = sqrt(X^2 + X T) - X:  half of a short
+    budget T, about sqrt(X T) of a long one.  Neither the rule nor what it is told looks at the image.
+
+    Args:
+        share: as in `TrainingSettings`; seconds: the budget.
+        spent: charged seconds of training so far.
+        seen: particles that the records on the camera's paths have seen by then, on average; 0: not known.
+    """
+    if seconds is None:
+        return math.inf
+    if share != "auto":
+        return share * seconds
+    if seen == 0:
+        return seconds / 2
+    X = spent * HALF_LEARNT / seen
+    return math.sqrt(X * X + X * seconds) - X
 
 
 def checkpoint_times(first: float, last: float, n: int) -> list[float]:
@@ -332,7 +363,7 @@ def load_scene(spec: CellSpec) -> mi.Scene:
 
 
 def references(experiment: Experiment, root: Path) -> dict[str, Reference]:
-    """Scene name -> reference, of every scene.
+    """Scene name -> reference, of every scene that does not do without.
 
     Args:
         root: the `--results` folder.
@@ -341,12 +372,12 @@ def references(experiment: Experiment, root: Path) -> dict[str, Reference]:
         ResultError: one is missing or broken; the message names the command that makes it.
     """
     found = {}
-    for scene in experiment.scene:
+    for scene in (scene for scene in experiment.scene if scene.has_reference):
         key = experiment.reference_key(scene)
         path = scene.reference or find_reference(key, reference_folders(experiment, root))
         if path is None:
             raise ResultError(f"scene {scene.name} has no reference {key}; make it with: "
-                              f"olpm-bench reference {shlex.quote(str(experiment.path))}")
+                              f"olpm-bench reference {shlex.quote(str(experiment.path))}, or do without: reference = \"none\"")
         found[scene.name] = read_reference(path, scene.width, scene.height)
     return found
 
@@ -356,16 +387,20 @@ def reference_folders(experiment: Experiment, root: Path) -> list[Path]:
     return [root / "references", experiment.path.parent / ".." / "results" / "references"]
 
 
-def run(experiment: Experiment, root: Path) -> list[str]:
+def run(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> list[str]:
     """Run what is not complete of an experiment; return one line for each cell that is not complete afterwards.
 
+    Args:
+        only: scenes to run; all by default.
+
     Raises:
+        ConfigError: no such scene.
         ResultError: a reference is missing (nothing was run), or a result is of a newer schema.
         SceneError, OSError: a scene cannot be used; a file cannot be written.
     """
-    results = Results(root / experiment.path.stem)
-    references(experiment, root)                            # before hours of work, not after
-    cells = experiment.cells()
+    results, part = Results(root / experiment.path.stem), experiment.of_scenes(only)
+    references(part, root)                                  # before hours of work, not after
+    cells = part.cells()
     loaded = {spec.scene.name: load_scene(spec) for spec in {c.scene.name: c for c in cells}.values()}
     todo, problems = [], []
     for spec in cells:
@@ -461,8 +496,11 @@ def memory(spec: CellSpec) -> float:
     return (300e6 + 120 * lanes + 100 * particles + pixels * 3 * (8 * 4 + 4 * spec.budget.checkpoints)) / 1e9
 
 
-def report(experiment: Experiment, root: Path) -> None:
+def report(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> None:
     """Summary, table and figures of a complete experiment; the table is printed.
+
+    Args:
+        only: scenes that must be complete; while others are not, their table is all there is, and what is missing is said.
 
     Raises:
         ResultError: a cell or a reference is missing.
@@ -470,12 +508,27 @@ def report(experiment: Experiment, root: Path) -> None:
     from olpm_bench.bench import summary
     from olpm_bench.report import figures, sheet
 
-    results, found = Results(root / experiment.path.stem), references(experiment, root)
+    results = Results(root / experiment.path.stem)
+    missing = Counter(spec.scene.name for spec in experiment.cells() if not is_complete(results, spec)[0]) if only else Counter()
+    if missing:
+        experiment = experiment.of_scenes(only)
+    found = references(experiment, root)
     summarised = summary.summarise(experiment, results, found)
-    summary.write(summarised, results)
-    figures.curves(results, experiment, found)
-    sheet.sheet(results, experiment, found)
     summary.print_table(summarised)
     if len(experiment.method) > 1:
-        summary.print_speed_ups(summary.speed_ups(experiment, results, found), experiment.method[0].name)
-    print(f"in {results.folder}: summary.json, table.csv, figure.png, figure.pdf, sheet.png")
+        summary.print_speed_ups(summary.speed_ups(experiment, results, found), experiment.baseline_name)
+    if missing:
+        cells = ", ".join(f"{n} of {scene}" for scene, n in missing.items())
+        print(f"no summary and no figures yet; cells missing: {cells}")
+        return
+    written = ["summary.json", "table.csv"]
+    summary.write(summarised, results)
+    if figures.gains(results, experiment, summarised):
+        written += ["gains.png", "gains.pdf"]
+    if found:
+        figures.curves(results, experiment, found)
+        sheet.sheet(results, experiment, found)
+        written += ["figure.png", "figure.pdf", "sheet.png"]
+    else:
+        print("no figure of L1 and no sheet: no scene has a reference")
+    print(f"in {results.folder}: {', '.join(written)}")

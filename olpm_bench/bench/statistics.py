@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from olpm_bench.bench import metrics
 from olpm_bench.transport.settings import InputError
 
 BAND = (5.0, 95.0)          # [%]
@@ -39,6 +40,12 @@ class Curve(NamedTuple):
     @property
     def median(self) -> np.ndarray:
         return np.median(self.errors, axis=0)
+
+
+class Work(NamedTuple):
+    """Final images of several seeds and what they cost: luminance (seeds, h, w), charged seconds (seeds)."""
+    luminance: np.ndarray
+    seconds: np.ndarray
 
 
 def median_band(values: Sequence[float] | np.ndarray) -> Band:
@@ -109,17 +116,20 @@ def time_to_error(times: np.ndarray, errors: np.ndarray, error: float) -> float:
     return float(np.exp(np.interp(-np.log(error), -log_e, log_t)))
 
 
-def bootstrap(statistic: Callable[[np.ndarray], float], n: int, seed: int = 0) -> Interval:
+def bootstrap(statistic: Callable[[np.ndarray], float], n: int, seed: int = 0, least: int = 1) -> Interval:
     """Percentile bootstrap of a statistic of seeds, which gets their numbers (n,) and so resamples methods in pairs.
 
+    Args:
+        least: different seeds that the statistic needs; resamples with fewer are left out.
+
     Returns:
-        The interval is NaN with one seed, and where some resample has no value.
+        The interval is NaN with `least` seeds or fewer, and where some resample has no value.
     """
     value = float(statistic(np.arange(n)))
-    if n < 2:
+    if n <= least:
         return Interval(value, float("nan"), float("nan"))
     drawn = np.random.default_rng(seed).integers(0, n, (RESAMPLES, n))
-    low, high = np.percentile([statistic(index) for index in drawn], BAND)
+    low, high = np.percentile([statistic(index) for index in drawn if len(np.unique(index)) >= least], BAND)
     return Interval(value, float(low), float(high))
 
 
@@ -164,6 +174,22 @@ def error_ratio(baseline: Curve, method: Curve, seconds: float | None = None) ->
         a, b = (interpolate(c.times, np.median(c.errors[index], axis=0), at)[0] for c in (baseline, method))
         return float(a / b)
     return bootstrap(ratio, len(method.errors))
+
+
+def gain(baseline: Work, method: Work) -> Interval:
+    """Work-normalised variance of the baseline over that of the method, with a paired bootstrap interval.
+
+    Returns:
+        NaN with one seed or black images; no interval with two seeds, which resample to themselves.  Few seeds have narrow
+        intervals: of simulated gains they covered 81 to 89 % with 6 and 8 seeds, half with 3.
+    """
+    if len(baseline.seconds) != len(method.seconds):
+        raise ValueError(f"{len(baseline.seconds)} and {len(method.seconds)} seeds: methods are compared in pairs of seeds")
+
+    def ratio(index: np.ndarray) -> float:
+        a, b = (metrics.relative_variance(work.luminance[index]) * work.seconds[index].mean() for work in (baseline, method))
+        return float(a / b) if b > 0 else float("nan")
+    return bootstrap(ratio, len(method.seconds), least=2)
 
 
 def _paired(a: Curve, b: Curve) -> None:

@@ -20,11 +20,12 @@ from olpm_bench.bench.results import SCHEMA_VERSION, Cell, Reference, ResultErro
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from olpm_bench.bench.config import Experiment
+    from olpm_bench.bench.config import Experiment, Scene
 
 COLUMNS = ("scene", "method", "seeds", "l1", "l1_low", "l1_high", "relmse", "relmse_trimmed",
-           "work_normalised_variance", "mean", "mean_stderr", "train_seconds", "render_seconds", "compile_seconds",
-           "wait_fraction", "spp", "records", "bytes_per_record", "particles", "invalid_pixels")
+           "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "training_passes",
+           "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records", "bytes_per_record",
+           "particles", "invalid_pixels")
 
 
 def complete_cells(experiment: Experiment, results: Results) -> dict[tuple[str, str], list[Cell]]:
@@ -47,16 +48,18 @@ def complete_cells(experiment: Experiment, results: Results) -> dict[tuple[str, 
     return cells
 
 
-def scene_reference(references: Mapping[str, Reference], scene: str, results: Results,
-                    experiment: Experiment) -> Reference:
-    """The reference of a scene.
+def scene_reference(references: Mapping[str, Reference], scene: Scene, results: Results,
+                    experiment: Experiment) -> Reference | None:
+    """The reference of a scene; None if the experiment does without.
 
     Raises:
         ResultError: there is none; the message names the command that makes it.
     """
-    if scene not in references:
-        raise ResultError(f"scene {scene} has no reference; make it with: {_command('reference', experiment, results)}")
-    return references[scene]
+    if not scene.has_reference:
+        return None
+    if scene.name not in references:
+        raise ResultError(f"scene {scene.name} has no reference; make it with: {_command('reference', experiment, results)}")
+    return references[scene.name]
 
 
 def _command(name: str, experiment: Experiment, results: Results) -> str:
@@ -76,8 +79,9 @@ def summarise(experiment: Experiment, results: Results, references: Mapping[str,
     """The summary of an experiment: ``{"schema_version", "rows"}``, one row a scene and method, in the TOML's order.
 
     Over seeds, a figure is the median; but `l1_low` and `l1_high` are the 5 and 95 % quantiles, `mean` is the mean
-    with its standard error, `compile_seconds` and `wait_fraction` are the largest, `invalid_pixels` is the sum.
-    What has no value (a spread of one seed, the error of an image with NaN) is None.
+    with its standard error, `compile_seconds` and `wait_fraction` are the largest, `invalid_pixels` is the sum.  `gain` is the
+    baseline's work-normalised variance over the method's, with its 90 % bootstrap interval.  What has no value (a spread
+    of one seed, the error of an image with NaN or of a scene without reference) is None.
 
     Args:
         references: by the name of the scene.
@@ -85,25 +89,39 @@ def summarise(experiment: Experiment, results: Results, references: Mapping[str,
     Raises:
         ResultError: a cell or reference is missing.
     """
-    rows = [_row(scene, method, cells, scene_reference(references, scene, results, experiment))
-            for (scene, method), cells in complete_cells(experiment, results).items()]
+    cells, rows = complete_cells(experiment, results), []
+    for scene in experiment.scene:
+        reference = scene_reference(references, scene, results, experiment)
+        images = {method.name: [cell.image()["mean"] for cell in cells[scene.name, method.name]] for method in experiment.method}
+        works = {name: _work(cells[scene.name, name], means) for name, means in images.items()}
+        for name, means in images.items():
+            gain = statistics.gain(works[experiment.baseline_name], works[name])
+            rows.append(_row(scene.name, name, cells[scene.name, name], means, reference, gain))
     return {"schema_version": SCHEMA_VERSION, "rows": rows}
 
 
-def _row(scene: str, method: str, cells: Sequence[Cell], reference: Reference) -> dict[str, Any]:
-    images = [cell.image()["mean"] for cell in cells]
+def _work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work:
+    seconds = np.array([cell.info["charged_seconds"] for cell in cells], np.float64)
+    return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
+
+
+def _row(scene: str, method: str, cells: Sequence[Cell], images: Sequence[np.ndarray], reference: Reference | None,
+         gain: statistics.Interval) -> dict[str, Any]:
+    def errors(metric: Callable[[np.ndarray, np.ndarray], float]) -> list[float]:
+        return [metric(image, reference.mean) if reference is not None else float("nan") for image in images]
+
     info = {key: np.array([cell.info[key] for cell in cells], np.float64) for key in (      # null becomes NaN
-        "train_seconds", "render_seconds", "compile_seconds", "charged_seconds", "wait_fraction", "spp", "records",
-        "bytes_per_record", "particles", "invalid_pixels", "mean", "mean_stderr")}
-    l1 = statistics.median_band([metrics.l1(image, reference.mean) for image in images])
+        "training_passes", "train_seconds", "render_seconds", "compile_seconds", "charged_seconds", "wait_fraction", "spp",
+        "records", "bytes_per_record", "particles", "invalid_pixels", "mean", "mean_stderr")}
+    l1 = statistics.median_band(errors(metrics.l1))
     row = {
         "scene": scene, "method": method, "seeds": [cell.seed for cell in cells],
         "l1": l1.median, "l1_low": l1.low, "l1_high": l1.high,
-        "relmse": np.median([metrics.relmse(image, reference.mean) for image in images]),
-        "relmse_trimmed": np.median([metrics.relmse_trimmed(image, reference.mean) for image in images]),
+        "relmse": np.median(errors(metrics.relmse)), "relmse_trimmed": np.median(errors(metrics.relmse_trimmed)),
         "work_normalised_variance": metrics.work_normalised_variance(images, float(np.mean(info["charged_seconds"]))),
-        "mean": np.mean(info["mean"]),
+        "gain": gain.value, "gain_low": gain.low, "gain_high": gain.high, "mean": np.mean(info["mean"]),
         "mean_stderr": np.sqrt(np.sum(info["mean_stderr"] ** 2)) / len(cells),      # seeds are independent
+        "training_passes": _whole(np.median(info["training_passes"])),
         "train_seconds": np.median(info["train_seconds"]), "render_seconds": np.median(info["render_seconds"]),
         "compile_seconds": np.max(info["compile_seconds"]), "wait_fraction": np.max(info["wait_fraction"]),
         "spp": _whole(np.median(info["spp"])), "records": _whole(np.median(info["records"])),
@@ -130,15 +148,21 @@ def write(summary: dict[str, Any], results: Results) -> None:
 
 def speed_ups(experiment: Experiment, results: Results,
               references: Mapping[str, Reference]) -> dict[str, dict[str, statistics.Interval]]:
-    """Speed-up of each method over the first one at equal L1: method -> scene -> ratio of charged seconds."""
+    """Speed-up of each method over the baseline at equal L1: method -> scene -> ratio of charged seconds.
+
+    Scenes without reference are left out.
+    """
     cells = complete_cells(experiment, results)
-    baseline, *others = (method.name for method in experiment.method)
+    baseline = experiment.baseline_name
+    others = [method.name for method in experiment.method if method.name != baseline]
     found: dict[str, dict[str, statistics.Interval]] = {method: {} for method in others}
-    for scene in (scene.name for scene in experiment.scene):
+    for scene in experiment.scene:
         reference = scene_reference(references, scene, results, experiment)
-        first = error_curve(cells[scene, baseline], reference)
+        if reference is None:
+            continue
+        first = error_curve(cells[scene.name, baseline], reference)
         for method in others:
-            found[method][scene] = statistics.speed_up(first, error_curve(cells[scene, method], reference))
+            found[method][scene.name] = statistics.speed_up(first, error_curve(cells[scene.name, method], reference))
     return found
 
 
@@ -150,19 +174,21 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
 
     table = Table(box=None, padding=(0, 1), collapse_padding=True, header_style="bold", pad_edge=False)
     scenes = list(dict.fromkeys(row["scene"] for row in summary["rows"]))
-    for name in ("method", "L1", "5-95 %", "relMSE", "trimmed", "var x s", "train s", "render s", "spp", "records"):
+    for name in ("method", "L1", "5-95 %", "relMSE", "trimmed", "var x s", "gain", "passes", "train s", "render s", "spp",
+                 "records"):
         table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
     notes = []
     for scene in scenes:
         rows = [row for row in summary["rows"] if row["scene"] == scene]
-        table.add_row(Text(scene, style="bold"), *[""] * 9)
+        table.add_row(Text(scene, style="bold"), *[""] * 11)
         best = min((row["l1"] for row in rows if row["l1"] is not None), default=None)
         for row in rows:
-            spread = "-" if len(row["seeds"]) == 1 else f"{number(row['l1_low'])}-{number(row['l1_high'])}"
+            spread = "-" if len(row["seeds"]) == 1 or row["l1"] is None else f"{number(row['l1_low'])}-{number(row['l1_high'])}"
             table.add_row(
                 Text("  " + row["method"]),
-                Text(number(row["l1"]), style="bold green" if row["l1"] == best else ""), spread,
+                Text(number(row["l1"]), style="bold green" if row["l1"] is not None and row["l1"] == best else ""), spread,
                 number(row["relmse"]), number(row["relmse_trimmed"]), number(row["work_normalised_variance"]),
+                _gain(row), f"{row['training_passes']}",
                 f"{row['train_seconds']:.1f}", f"{row['render_seconds']:.1f}", f"{row['spp']}", f"{row['records']}")
             label = f"{scene} / {row['method']}"
             if row["wait_fraction"] > WAITED:
@@ -176,6 +202,11 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
     console.width = terminal
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+
+
+def _gain(row: Mapping[str, Any]) -> str:
+    spread = f" ({number(row['gain_low'])}-{number(row['gain_high'])})" if row["gain_low"] is not None else ""
+    return number(row["gain"]) + spread
 
 
 def print_speed_ups(found: Mapping[str, Mapping[str, statistics.Interval]], baseline: str,

@@ -1,9 +1,10 @@
-"""The convergence figure: L1 error over charged seconds, one panel a scene.
+"""The convergence figure, L1 error over charged seconds, one panel a scene; and the gains in variance with their intervals.
 
 Reads results, renders nothing.  Colour, marker and dash belong to a method by its place in the TOML.
 """
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -29,6 +30,7 @@ PLAIN: dict[str, Any] = {"marker": "none", "linestyle": "-"}
 NEAR_FLOOR = 2.0                # errors below this many noise floors are the reference's own: drawn faintly
 PANEL = (2.75, 2.05)            # width, height of a panel's axes [inch]
 COLUMNS = 2                     # panels side by side
+ROW = 0.17                      # height of a row of gains [inch]
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,8 @@ def curves(results: Results, experiment: Experiment, references: Mapping[str, Re
            out: Path | None = None) -> None:
     """Write figure.png and figure.pdf into `out` (the results folder by default).
 
-    A budget in samples puts samples per pixel on the abscissa, one in seconds charged seconds.
+    A budget in samples puts samples per pixel on the abscissa, one in seconds charged seconds.  Scenes without reference are
+    left out; there must be another.
 
     Raises:
         ResultError: a cell or reference is missing; the message names the command that makes it.
@@ -59,13 +62,15 @@ def curves(results: Results, experiment: Experiment, references: Mapping[str, Re
     over = "seconds" if experiment.budget.spp is None else "spp"
     cells = summary.complete_cells(experiment, results)
     panels = []
-    for scene in (scene.name for scene in experiment.scene):
+    for scene in experiment.scene:
         reference = summary.scene_reference(references, scene, results, experiment)
-        methods = {method.name: cells[scene, method.name] for method in experiment.method}
+        if reference is None:
+            continue
+        methods = {method.name: cells[scene.name, method.name] for method in experiment.method}
         trained = {method: float(np.median([cell.trace[0]["train_seconds"] for cell in group]))
                    for method, group in methods.items()}
         panels.append(Panel(
-            title=scene if len(experiment.scene) > 1 else experiment.title,
+            title=scene.name if len(experiment.scene) > 1 else experiment.title,
             curves={method: summary.error_curve(group, reference, over=over) for method, group in methods.items()},
             training={method: t for method, t in trained.items() if t > 0} if over == "seconds" else {},
             budget=experiment.budget.seconds or experiment.budget.spp or 0,
@@ -75,7 +80,92 @@ def curves(results: Results, experiment: Experiment, references: Mapping[str, Re
     with style():
         figure = draw(panels, "time [s], training included" if over == "seconds" else "samples per pixel",
                       experiment.title if len(panels) > 1 else "", note)
-        save(figure, out or results.folder)
+        save(figure, out or results.folder, "figure")
+
+
+def gains(results: Results, experiment: Experiment, summarised: Mapping[str, Any], out: Path | None = None) -> bool:
+    """Write gains.png and gains.pdf into `out` (the results folder by default), unless there is one method or seed only.
+
+    Args:
+        summarised: by `summary.summarise`.
+
+    Returns:
+        Whether there was something to draw.
+    """
+    rows = [row for row in summarised["rows"] if row["method"] != experiment.baseline_name]
+    if not any(row["gain"] is not None for row in rows):
+        return False
+    n, machine_ = len(experiment.seeds), machine(read_json(results.folder / "env.json"))
+    spread = f"90 % bootstrap intervals over {n} paired seeds." if n > 2 else f"{n} seeds."
+    with style():
+        figure = draw_gains(rows, [method.name for method in experiment.method], experiment.baseline_name, experiment.title,
+                            f"Relative variance of a pixel (median) times charged seconds. {spread} {machine_}")
+        save(figure, out or results.folder, "gains")
+    return True
+
+
+def draw_gains(rows: Sequence[Mapping[str, Any]], methods: Sequence[str], baseline: str, title: str = "",
+               note: str = "") -> Figure:
+    """The gains, in the style that is active.
+
+    Args:
+        rows: of the summary, without the baseline's, scene by scene; methods: all names, in the order of the TOML.
+    """
+    from matplotlib import rcParams
+    from matplotlib.figure import Figure
+
+    styles = dict(zip(methods, itertools.cycle(rcParams["axes.prop_cycle"]), strict=False))
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    lines: list[Mapping[str, Any] | str] = []       # from the top: a scene's name above its rows
+    for scene in scenes:
+        lines += [scene, *(row for row in rows if row["scene"] == scene)]
+    numbers = {i: _gain_label(row) for i, row in enumerate(lines) if not isinstance(row, str)}
+    left = 0.2 + max(*(0.12 + _text_width(row["method"], 8) for row in rows), *(_text_width(scene, 8.5) for scene in scenes))
+    right, bottom, head = 0.2 + max(_text_width(text, 7.5) for text in numbers.values()), 0.42, 0.34 if title else 0.1
+    width, inner = left + PANEL[0] + right, ROW * (len(lines) + 0.6)
+    caption_ = textwrap.wrap(note, width=int((width - 0.2) * 21))
+    foot = 0.06 + 0.115 * len(caption_)
+    height = head + inner + bottom + foot
+    figure = Figure(figsize=(width, height))
+    axes = figure.add_axes((left / width, (foot + bottom) / height, PANEL[0] / width, inner / height))
+    axes.set_xscale("log")
+    ends = [1, *(row[key] for row in rows for key in ("gain", "gain_low", "gain_high") if row[key])]
+    low, high = _padded(min(ends), max(ends), 0.06)
+    axes.set(xlim=(low, high), ylim=(len(lines) - 0.2, -0.8))
+    axes.set_xlabel(f"gain over {baseline}: ratio of var \N{MULTIPLICATION SIGN} s")
+    positions = ticks(low, high)
+    axes.xaxis.set_ticks(positions, [tick_label(position) for position in positions])
+    axes.xaxis.set_ticks([], minor=True)
+    axes.yaxis.set_ticks([])
+    axes.axvline(1, color="#555555", linewidth=0.9, zorder=1)
+    for y, row in enumerate(lines):
+        if isinstance(row, str):
+            axes.text(-(left - 0.1) / PANEL[0], y, row, transform=axes.get_yaxis_transform(), va="center_baseline", fontsize=8.5)
+            continue
+        look = styles[row["method"]]
+        axes.text(-0.1 / PANEL[0], y, row["method"], color=look["color"], ha="right", transform=axes.get_yaxis_transform(),
+                  va="center_baseline")
+        axes.text(1 + 0.1 / PANEL[0], y, numbers[y], transform=axes.get_yaxis_transform(), va="center_baseline", fontsize=7.5)
+        if row["gain_low"] is not None:
+            axes.plot([row["gain_low"], row["gain_high"]], [y, y], color=look["color"], linewidth=1.1, marker="|", markersize=5,
+                      markeredgecolor=look["color"], markeredgewidth=0.9, linestyle="-")
+        if row["gain"] is not None:
+            axes.plot(row["gain"], y, **{**look, "linestyle": "none"}, markersize=5, zorder=3)
+    if title:
+        figure.text(0.5, 1 - 0.08 / height, title, ha="center", va="top", fontsize=10.5)
+    figure.text(0.1 / width, 0.04 / height, "\n".join(caption_), ha="left", va="bottom", fontsize=6.5, color="#555555",
+                linespacing=1.2)
+    return figure
+
+
+def _gain_label(row: Mapping[str, Any]) -> str:
+    def short(value: float) -> str:
+        return f"{value:#.3g}".rstrip(".")
+
+    if row["gain"] is None:
+        return "-"
+    spread = f" ({short(row['gain_low'])}\N{EN DASH}{short(row['gain_high'])})" if row["gain_low"] is not None else ""
+    return short(row["gain"]) + spread
 
 
 def style() -> AbstractContextManager[None]:
@@ -85,11 +175,11 @@ def style() -> AbstractContextManager[None]:
     return matplotlib.style.context(STYLE)
 
 
-def save(figure: Figure, folder: Path) -> None:
-    """Write figure.png and figure.pdf."""
-    with replacing(folder / "figure.png") as beside:
+def save(figure: Figure, folder: Path, name: str) -> None:
+    """Write name.png and name.pdf."""
+    with replacing(folder / f"{name}.png") as beside:
         figure.savefig(beside)
-    with replacing(folder / "figure.pdf") as beside:
+    with replacing(folder / f"{name}.pdf") as beside:
         figure.savefig(beside, metadata={"CreationDate": None})
 
 

@@ -42,17 +42,21 @@ def sheet(results: Results, experiment: Experiment, references: Mapping[str, Ref
           out: Path | None = None) -> None:
     """Write sheet.png into `out` (the results folder by default); of each method the seed with the median L1.
 
+    Scenes without reference are left out; there must be another.
+
     Raises:
         ResultError: a cell or reference is missing; the message names the command that makes it.
     """
     cells = summary.complete_cells(experiment, results)
     blocks = []
-    for scene in (scene.name for scene in experiment.scene):
+    for scene in experiment.scene:
         reference = summary.scene_reference(references, scene, results, experiment)
+        if reference is None:
+            continue
         images = {}
         for method in (method.name for method in experiment.method):
-            images[method] = _median_image([cell.image()["mean"] for cell in cells[scene, method]], reference.mean)
-        blocks.append(Block(scene, reference.mean, reference.noise_floor, images))
+            images[method] = _median_image([cell.image()["mean"] for cell in cells[scene.name, method]], reference.mean)
+        blocks.append(Block(scene.name, reference.mean, reference.noise_floor, images))
     note = _caption(experiment, read_json(results.folder / "env.json"))
     with figures.style():
         figure = draw(blocks, note)

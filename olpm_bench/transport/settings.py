@@ -24,10 +24,11 @@ def _require(ok: bool, name: str, value: object, allowed: str) -> None:
         raise InputError(f"{name} = {value!r}: must be {allowed}")
 
 
-def _require_types(settings: Any) -> None:
+def _require_types(settings: Any, *apart: str) -> None:
+    """All fields but those `apart` have the types of their defaults."""
     for f in dataclasses.fields(settings):
         value = getattr(settings, f.name)
-        allowed = wrong_type(value, f.default)
+        allowed = wrong_type(value, f.default) if f.name not in apart else None
         _require(allowed is None, f.name, value, allowed or "")
 
 
@@ -70,7 +71,8 @@ class TrainingSettings:
     photons, importons: paths emitted in a particle pass.
     camera_passes: at most so many passes of camera paths, which render the image and teach the guide.
     camera_paths: paths of such a pass: as many samples a pixel, rounded to a power of two, as come nearest; at least one.
-    share: of a budget in seconds, after which training ends; 1 trains all passes whatever they take.
+    share: of a budget in seconds, after which training ends; 1 trains all passes whatever they take.  "auto": when learning on
+        is expected to cost more variance than it saves, at most half of the budget; see `bench.run.end_of_training`.
     blend: let the images of camera passes of the second half of training into the result, sample for sample.
     while_rendering: go on learning from the paths of every rendering pass.
     gather: "binned": the particles whose look-up gives the record, at most `neighbours` of them;
@@ -94,7 +96,7 @@ class TrainingSettings:
     importons: int = 100_000
     camera_passes: int = 24
     camera_paths: int = 2 ** 17
-    share: float = 0.35
+    share: float | Literal["auto"] = 0.35
     blend: bool = True
     while_rendering: bool = False
     gather: Literal["binned", "nearest"] = "binned"
@@ -108,7 +110,7 @@ class TrainingSettings:
     window: Literal["flux", "contribution"] = "contribution"
 
     def __post_init__(self) -> None:
-        _require_types(self)
+        _require_types(self, "share")
         _require_choice(self, "schedule", "interleaved", "single_batch")
         _require_choice(self, "gather", "binned", "nearest")
         _require_choice(self, "emission", "guided", "emitter")
@@ -117,7 +119,8 @@ class TrainingSettings:
             _require(getattr(self, name) >= 0, name, getattr(self, name), ">= 0")
         for name in ("photons", "camera_paths", "neighbours"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), ">= 1")
-        _require(0 < self.share <= 1, "share", self.share, "in (0, 1]")
+        number = isinstance(self.share, int | float) and not isinstance(self.share, bool)
+        _require(self.share == "auto" or (number and 0 < self.share <= 1), "share", self.share, "in (0, 1], or 'auto'")
         _require(0 < self.record_radius <= 0.25, "record_radius", self.record_radius, "in (0, 0.25] of the scene's diagonal")
         _require(0 < self.fraction <= 1, "fraction", self.fraction, "in (0, 1]")
         _require(0 < self.emission_fraction <= 1, "emission_fraction", self.emission_fraction, "in (0, 1]")

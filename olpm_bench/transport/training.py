@@ -47,6 +47,7 @@ class PassStatistics:
     kept: int = 0                   # of which taught a record
     records: int = 0                # of the radiance guide
     regions: dict[str, np.ndarray] = field(default_factory=dict)    # where a caller names them: `Particles.by_region`
+    seen: float = 0.0               # particles seen so far by the records that camera paths met, on average
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("trace", "grow", "gather", "update"), 0.0))
     image: mi.TensorXf | None = field(default=None, repr=False)
 
@@ -144,6 +145,9 @@ class Training:
             settings.emission == "guided" and settings.schedule == "interleaved" and distant_lights(scene)) else None
         self.regions = regions
         self.sensor = sensor or scene.sensors()[0]
+        film = self.sensor.film()
+        self.pixels = int(np.prod(film.crop_size() + 2 * film.rfilter().border_size() * film.sample_border()))
+        self.camera_spp = 1 << max(0, round(np.log2(settings.camera_paths / self.pixels)))      # of a camera pass
         self.sampler = mi.load_dict({"type": "independent"})
         self.draws = 0                      # seeds used so far
         # Of photons and importons: hits a particle leaves in their first pass, and what the window is told for as many.
@@ -229,10 +233,8 @@ class Training:
 
     def _camera_pass(self, statistics: PassStatistics) -> PassStatistics:
         """Render an image with the guide as it is, and learn from its paths."""
-        film = self.sensor.film()
-        pixels = int(np.prod(film.crop_size() + 2 * film.rfilter().border_size() * film.sample_border()))
-        spp = 1 << max(0, round(np.log2(self.settings.camera_paths / pixels)))
-        paths = CameraPaths(pixels, spp, self.max_depth)
+        spp = self.camera_spp
+        paths = CameraPaths(self.pixels, spp, self.max_depth)
         with _Seconds(statistics, "trace"):
             image = self.integrator.render_paths(self.scene, self.sensor, self._next_seed(), spp, paths)
             dr.eval(image)
@@ -245,10 +247,12 @@ class Training:
             with _Seconds(statistics, "gather"):
                 batch = binned(guide.cache, vertices, self.settings.neighbours)
                 place, offset = by_record(guide.cache, vertices)
+            before = guide.count.numpy()
             with _Seconds(statistics, "update"):
                 guide.learn_returned(*paths.returned(place), offset)
                 guide.learn_camera(batch, self._next_seed())
-            statistics.kept = len(batch)
+            statistics.kept, count = len(batch), guide.count.numpy()
+            statistics.seen = float(np.mean(count[count > before])) if len(batch) else 0.0
         self._estimate_pixels(image, spp)
         statistics.spp, statistics.stored, statistics.image = spp, len(vertices), image
         statistics.records = guide.records

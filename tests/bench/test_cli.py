@@ -104,6 +104,33 @@ def test_run_prints_the_table_and_writes_the_report(experiment, tmp_path):
     assert [row["spp"] for row in rows] == [4, 4] and rows[0]["seeds"] == [0, 1]
 
 
+BOTH = TOML.replace("max_depth = 3", 'max_depth = 3\nreference = "none"').replace("[[method]]", """[[scene]]
+name = "door_ajar"
+width = 48
+height = 36
+max_depth = 3
+reference = "none"
+[[method]]""", 1)
+
+
+def test_scenes_one_by_one_and_without_references(tmp_path):
+    path, folder = tmp_path / "test.toml", tmp_path / "results" / "test"
+    path.write_text(BOTH)
+    run = ("run", path, "--results", tmp_path / "results")
+    assert "4 of 4 cells to run" in call(*run, "--only-scene", "door_ajar", "--dry-run").stdout
+    part = call(*run, "--only-scene", "door_ajar")
+    assert part.exit_code == 0, part.output
+    assert "Roulette" in part.stdout and "no summary and no figures yet; cells missing: 4 of cornell_box" in part.stdout
+    assert (folder / "experiment.toml").read_text().count("[[scene]]") == 2 and not (folder / "summary.json").exists()
+    whole = call(*run)
+    assert whole.exit_code == 0, whole.output
+    assert "no figure of L1 and no sheet: no scene has a reference" in whole.stdout
+    assert {f.name for f in folder.iterdir() if f.is_file()} == {
+        "experiment.toml", "env.json", "summary.json", "table.csv", "gains.png", "gains.pdf"}
+    assert call(*run, "--only-scene", "door_ajar").stdout == whole.stdout      # all is complete: the report is whole
+    assert "no scene 'room' in test.toml" in complaint(call(*run, "--only-scene", "room"))
+
+
 def test_dry_run_runs_nothing(experiment, tmp_path):
     result = call("run", experiment, "--results", tmp_path / "results", "--dry-run")
     assert result.exit_code == 0 and "4 of 4 cells to run" in result.stdout and "GB" in result.stdout
@@ -187,7 +214,9 @@ def test_render_writes_an_image_and_ends_with_json(tmp_path):
 
 def test_a_guide_is_saved_and_used_again(tmp_path):
     options = ("--method", "cosine", "--spp", 2, "--width", 16, "--height", 12, "--max-depth", 3)
-    training = ("--set", "training.passes=1", "--set", "training.photons=500", "--set", "training.importons=100")
+    training = ("--set", "training.passes=1", "--set", "training.photons=500", "--set", "training.importons=100",
+                "--set", "training.camera_passes=2", "--set", "training.camera_paths=200",
+                "--set", "training.blend=false")
     guide = tmp_path / "g.npz"
     first = call("render", "cornell_box", *options, *training, "--out", tmp_path / "a.exr", "--save-guide", guide)
     assert first.exit_code == 0, first.output

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import pytest
 
-from olpm_bench.bench.clock import Clock, charge, thread_times
+from olpm_bench.bench.clock import Clock, Lap, charge, thread_times
 
 
 def test_two_busy_threads_share_what_they_waited():
@@ -53,6 +53,18 @@ def test_laps_add_up_by_label_and_time_between_them_is_free():
     assert clock.charged == pytest.approx(clock["train"].charged + clock["render"].charged)
     assert 0 < clock.total.charged <= clock.total.wall
     assert clock["never"].wall == 0
+
+
+def test_a_share_of_a_label_is_moved_to_another():
+    train, render = Lap(wall=4.0, cpu=6.0, wait=1.0, compile=0.4, charged=3.0), Lap(wall=1.0, charged=1.0)
+    clock = Clock(laps={"train": train, "render": render})
+    before = clock.total
+    clock.move(0.25, "train", "render")
+    assert clock["train"] == Lap(wall=3.0, cpu=4.5, wait=0.75, compile=pytest.approx(0.3), charged=2.25)
+    assert clock["render"] == Lap(wall=2.0, cpu=1.5, wait=0.25, compile=pytest.approx(0.1), charged=1.75)
+    assert clock.total == before
+    clock.move(1.0, "train", "other")
+    assert clock["train"] == Lap() and clock["other"].charged == 2.25 and clock.charged == 4.0
 
 
 def test_a_lap_that_raises_is_not_counted():

@@ -1,6 +1,7 @@
 """Experiment files: what is read, what is refused and with which words, and what determines a cell."""
 from __future__ import annotations
 
+import dataclasses
 import tomllib
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from olpm_bench.bench import config
 from olpm_bench.bench.config import ConfigError
+from olpm_bench.transport import settings
 
 MINIMAL = """
 title = "Test"
@@ -88,6 +90,51 @@ def test_presets_bring_their_roulette(tmp_path):
     assert roulettes(preset, own='integrator = { roulette = "throughput" }') == ["contribution", "throughput"]
 
 
+def test_presets_are_resolved_in_the_results_and_read_back_as_the_same_cells(tmp_path):
+    text = MINIMAL.replace("passes = 2", 'preset = "paper2014"\npasses = 2\nshare = "auto"')
+    text += 'training = { preset = "paper2014_norr", photons = 7 }\n'
+    text += '[[method]]\nname = "Talk"\nrepresentation = { type = "jensen" }\n'
+    text += '[[method]]\nname = "Best"\nrepresentation = { type = "jensen" }\ntraining = { preset = "best", share = 0.5 }\n'
+    experiment = load(tmp_path, text.replace('integrator = { roulette = "throughput" }\n', ""))
+    resolved = experiment.toml()
+    assert "preset" not in resolved
+    methods = {method["name"]: method for method in tomllib.loads(resolved)["method"]}
+    assert [methods[m]["integrator"]["roulette"] for m in ("Path tracing", "Cosine", "Talk", "Best")] == [
+        "contribution", "none", "throughput", "contribution"]
+    assert methods["Cosine"]["training"]["photons"] == 7 and methods["Cosine"]["training"]["gather"] == "nearest"
+    assert methods["Talk"]["training"]["share"] == "auto" and methods["Best"]["training"]["share"] == 0.5
+    assert [c.key for c in load(tmp_path, resolved).cells()] == [c.key for c in experiment.cells()]
+
+
+def test_a_scene_may_do_without_a_reference(tmp_path):
+    assert load(tmp_path, MINIMAL).scene[0].has_reference
+    experiment = load(tmp_path, MINIMAL.replace("width = 16", 'width = 16\nreference = "none"'))
+    assert not experiment.scene[0].has_reference
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    assert tomllib.loads(experiment.toml(folder))["scene"][0]["reference"] == "none"
+    (folder / "again.toml").write_text(experiment.toml(folder))
+    assert not config.load(folder / "again.toml").scene[0].has_reference
+    assert [c.key for c in experiment.cells()] == [c.key for c in load(tmp_path, MINIMAL).cells()]
+
+
+def test_the_baseline_is_the_first_method_or_the_named_one(tmp_path):
+    assert load(tmp_path, MINIMAL).baseline_name == "Path tracing"
+    experiment = load(tmp_path, MINIMAL.replace("seeds = 2", 'seeds = 2\nbaseline = "Cosine"'))
+    assert experiment.baseline_name == "Cosine" and load(tmp_path, experiment.toml()).baseline_name == "Cosine"
+
+
+def test_some_scenes_of_an_experiment(tmp_path):
+    second = '[[scene]]\nname = "door_ajar"\nwidth = 8\nheight = 8\n'
+    experiment = load(tmp_path, MINIMAL + second)
+    part = experiment.of_scenes(["door_ajar"])
+    assert [s.name for s in part.scene] == ["door_ajar"] and part.path == experiment.path
+    assert [c.key for c in part.cells()] == [c.key for c in experiment.cells()][4:]
+    assert experiment.of_scenes([]).scene == experiment.scene
+    with pytest.raises(ConfigError, match=r"no scene 'room' in test\.toml; known: cornell_box, door_ajar"):
+        experiment.of_scenes(["room"])
+
+
 @pytest.mark.parametrize("old, new, words", [
     ("seeds = 2", "sedes = 2", ["unknown key 'sedes' in test.toml", "known:", "seeds"]),
     ("spp = 8", "spps = 8", ["unknown key 'spps' in test.toml [budget]", "seconds, spp, checkpoints"]),
@@ -129,6 +176,13 @@ def test_presets_bring_their_roulette(tmp_path):
     ('roulette = "throughput"', 'rr_depth = "two"', ["'Cosine' integrator", "rr_depth = 'two'", "a whole number"]),
     ('representation = { type = "cosine" }', 'representation = { type = "cosine" }\ntraining = { preset = ["best"] }',
      ["'Cosine' training", "unknown preset ['best']"]),
+    ("passes = 2", "share = 0", ["[training]", "share = 0", "in (0, 1], or 'auto'"]),
+    ("passes = 2", 'share = "all"', ["[training]: share", "'all'", "'auto'"]),
+    ("passes = 2", "share = true", ["[training]: share", "True"]),
+    ("seeds = 2", 'seeds = 2\nbaseline = "PT"', ["baseline = 'PT'", "no method of this name", "known: Path tracing, Cosine"]),
+    ("seeds = 2", "seeds = 2\nbaseline = 3", ["baseline = 3", "string"]),
+    ("width = 16", "width = 16\nreference = 3", ["[[scene]] 1: reference = 3"]),
+    ("width = 16", 'width = 16\nreference = "None"', ["no such file or folder", '"none" does without']),
     ("passes = 2", "photons = 2.5", ["[training]", "photons", "2.5"]),
     ("width = 16", "width = 16\nparameters = { light_size = 3 }", ["'cornell_box'", "light_size = 3.0", "[0.01, 1.9]"]),
     ("spp = 8", "spp = ", ["test.toml is not valid TOML", "line 5"]),
@@ -169,6 +223,33 @@ def test_the_key_follows_our_own_code_and_the_reference_does_not(tmp_path, monke
 def test_the_committed_reference_keeps_its_key():
     quickstart = config.load(Path(__file__).resolve().parents[2] / "experiments" / "quickstart.toml")
     assert quickstart.reference_key(quickstart.scene[0]) == "door_ajar-96x54-075c0ded"
+
+
+def of_this_project(tmp_path: Path, name: str) -> config.Experiment:
+    """An experiment of ours, with an empty scene in the place of other people's."""
+    (tmp_path / "room.xml").write_text(XML)
+    file = Path(__file__).resolve().parents[2] / "experiments" / name
+    scenes = [scene["name"] for scene in tomllib.loads(file.read_text())["scene"] if "file" in scene]
+    return config.load(file, dict.fromkeys(scenes, tmp_path / "room.xml"))
+
+
+def test_the_ablation_leaves_out_one_addition_at_a_time(tmp_path):
+    experiment = of_this_project(tmp_path, "ablation.toml")
+    best, *others = ({**dataclasses.asdict(c.integrator), **dataclasses.asdict(c.training)} for c in
+                     experiment.cells()[:len(experiment.method)])
+    assert experiment.baseline_name == experiment.method[0].name == "best" and len(experiment.seeds) >= 8
+    for other in others:
+        assert sum(other[key] != best[key] for key in best) == 1
+
+
+def test_the_targets_compare_presets_with_plain_path_tracing(tmp_path):
+    experiment = of_this_project(tmp_path, "targets.toml")
+    scene, names = experiment.scene[0], [method.name for method in experiment.method]
+    assert experiment.baseline_name == "Path tracing" and experiment.method[0].representation is None
+    for name, method in zip(names[1:], experiment.method[1:], strict=True):
+        preset = name.removeprefix("GMM ")
+        assert experiment.training_of(method) == settings.training(preset)
+        assert experiment.integrator_of(scene, method) == settings.integrator(preset)
 
 
 def test_a_missing_file_and_one_that_is_no_text(tmp_path):

@@ -18,11 +18,13 @@ def test_figures_of_the_issue(monkeypatch):
     monkeypatch.setattr(perf, "EACH", 16)
     monkeypatch.setattr(perf, "MAX_DEPTH", 4)
     monkeypatch.setattr(perf, "PARTICLES", {"photons": 2000, "importons": 500})
+    monkeypatch.setattr(perf, "CAMERA_PATHS", 400)
     monkeypatch.setattr(representations, "names", lambda: ["cosine", "gaussian_mixture"])
     figures = json.loads(json.dumps(perf.measure("cornell_box", 16, 12, spp=2, passes=3), allow_nan=False))
     assert figures["scene"] == "cornell_box" and (figures["width"], figures["height"]) == (16, 12)
-    assert isinstance(figures["recompiles_after_warmup"], int)
+    assert isinstance(figures["recompiles_after_warmup"], int) and isinstance(figures["camera_recompiles_after_warmup"], int)
     assert {"trace", "gather", "update"} <= figures["pass_seconds"].keys() == figures["pass_seconds_nearest"].keys()
+    assert figures["camera_pass_seconds"].keys() == figures["pass_seconds"].keys() and len(figures["camera_rss_mb_by_pass"]) == 3
     assert figures["guided_vertex_ns"].keys() == {"cosine", "gaussian_mixture"} and len(figures["rss_mb_by_pass"]) == 3
     for value in (figures["em_ns_per_particle"], figures["unguided_vertex_ns"], *figures["guided_vertex_ns"].values(),
                   figures["peak_rss_mb"]):

@@ -14,8 +14,8 @@ from olpm_bench.bench import config, metrics, statistics, summary
 from olpm_bench.bench.results import Reference, ResultError, Results
 
 KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "relmse", "relmse_trimmed", "work_normalised_variance",
-        "mean", "mean_stderr", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
-        "bytes_per_record", "particles", "invalid_pixels"]
+        "gain", "gain_low", "gain_high", "mean", "mean_stderr", "training_passes", "train_seconds", "render_seconds",
+        "compile_seconds", "wait_fraction", "spp", "records", "bytes_per_record", "particles", "invalid_pixels"]
 ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
 TIMES = [1.0, 4.0, 16.0]
 
@@ -31,7 +31,7 @@ def folder(tmp_path, errors: dict[str, list[float]], seeds: list[int]) -> Simple
         i = seeds.index(cell.seed)
         error = errors[cell.method.name][i]
         images = [truth + np.float32(error * np.sqrt(16 / t)) for t in TIMES]
-        info = {"key": cell.key, "spp": 100 + i, "charged_seconds": 16.0, "train_seconds": 2.0 + i,
+        info = {"key": cell.key, "spp": 100 + i, "charged_seconds": 16.0, "training_passes": 3 + i, "train_seconds": 2.0 + i,
                 "render_seconds": 14.0 - i, "compile_seconds": 5.0 if i == 0 else 0.0, "wait_fraction": 0.1 * i,
                 "records": 1000 + i, "bytes_per_record": 256, "particles": 50_000, "invalid_pixels": 0,
                 "mean": 1 + error, "mean_stderr": 0.3}
@@ -76,12 +76,42 @@ def test_figures_over_seeds(known):
 def test_one_seed_has_no_variance_and_json_has_no_nan(tmp_path):
     known = folder(tmp_path, {"Alone": [0.5]}, [0])
     result = summarised(known)
-    assert result["rows"][0]["work_normalised_variance"] is None
+    assert result["rows"][0]["work_normalised_variance"] is None and result["rows"][0]["gain"] is None
     summary.write(result, known.results)
     written = json.loads((known.results.folder / "summary.json").read_text(), parse_constant=pytest.fail)
     assert written == result
     row, = csv.DictReader(io.StringIO((known.results.folder / "table.csv").read_text()))
     assert list(row) == KEYS and row["work_normalised_variance"] == "" and float(row["l1"]) == result["rows"][0]["l1"]
+
+
+def without_reference(known, **changes) -> SimpleNamespace:
+    scenes = [scene.model_copy(update={"reference": config.NO_REFERENCE}) for scene in known.experiment.scene]
+    experiment = known.experiment.model_copy(update={"scene": scenes, **changes})
+    return SimpleNamespace(experiment=experiment, results=known.results, references={})
+
+
+def test_a_scene_without_reference_has_no_errors_but_all_the_rest(known):
+    rows, expected = summarised(without_reference(known))["rows"], summarised(known)["rows"]
+    for row, full in zip(rows, expected, strict=True):
+        errors = ("l1", "l1_low", "l1_high", "relmse", "relmse_trimmed")
+        assert [row[key] for key in errors] == [None] * 5
+        assert {k: v for k, v in row.items() if k not in errors} == {k: v for k, v in full.items() if k not in errors}
+    assert summary.speed_ups(without_reference(known).experiment, known.results, {}) == {"Fast": {}}
+    console = Console(file=io.StringIO(), width=200)
+    summary.print_table({"rows": rows}, console)
+    shown = console.file.getvalue().splitlines()[2].split()
+    assert shown[:6] == ["Slow", "-", "-", "-", "-", summary.number(rows[0]["work_normalised_variance"])]
+
+
+def test_gains_and_speed_ups_are_over_the_baseline(known):
+    slow, fast = summarised(known)["rows"]
+    assert [slow[key] for key in ("gain", "gain_low", "gain_high")] == [1, 1, 1]
+    assert fast["gain"] == pytest.approx(slow["work_normalised_variance"] / fast["work_normalised_variance"])
+    assert fast["gain_low"] <= fast["gain"] <= fast["gain_high"] and fast["training_passes"] == 4
+    known.experiment = known.experiment.model_copy(update={"baseline": "Fast"})
+    assert [row["gain"] for row in summarised(known)["rows"]] == pytest.approx([1 / fast["gain"], 1])
+    found = summary.speed_ups(known.experiment, known.results, known.references)
+    assert list(found) == ["Slow"] and found["Slow"]["door_ajar"].value == pytest.approx(0.25, rel=1e-4)
 
 
 def test_what_a_cell_does_not_know_is_null(known):

@@ -28,7 +28,7 @@ def finished(tmp_path) -> SimpleNamespace:
         name, times = cell.method.name, np.geomspace(2, 16, 5)
         images = [truth + rng.normal(0, NOISE[name] / np.sqrt(t), truth.shape).astype(np.float32) for t in times]
         trace = [{"seconds": t, "train_seconds": TRAINING[name], "spp": round(10 * t)} for t in times]
-        info = {"key": cell.key, "spp": 160, "charged_seconds": 16.0, "train_seconds": TRAINING[name],
+        info = {"key": cell.key, "spp": 160, "charged_seconds": 16.0, "training_passes": 0, "train_seconds": TRAINING[name],
                 "render_seconds": 16 - TRAINING[name], "compile_seconds": 1.0, "wait_fraction": 0.0, "records": 0,
                 "bytes_per_record": 0, "particles": 0, "invalid_pixels": 0, "mean": 0.5, "mean_stderr": 0.01}
         results.write_cell(cell.scene.name, name, cell.seed, info, trace,

@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import itertools
+import json
+import shutil
 
 import matplotlib
 import numpy as np
@@ -9,9 +11,9 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from skimage.io import imread
 
-from olpm_bench.bench import statistics
+from olpm_bench.bench import config, statistics, summary
 from olpm_bench.bench.results import ResultError
-from olpm_bench.report import figures
+from olpm_bench.report import figures, sheet
 
 TIMES = np.geomspace(1, 16, 9)
 
@@ -107,6 +109,69 @@ def test_from_a_results_folder(finished):
     note = figures.caption(finished.experiment, {"cpu": "Abacus 2", "threads": 2})
     assert note == ("Median and 5\N{EN DASH}95 % band of 3 seeds. Time includes training; triangles mark its end. "
                     "Abacus 2, 2 threads.")
+
+
+def gain_rows(methods: list[str], scenes: list[str]) -> list[dict]:
+    return [{"scene": scene, "method": method, "gain": 2.0 ** i, "gain_low": 1.8 ** i, "gain_high": 2.3 ** i}
+            for scene in scenes for i, method in enumerate(methods)]
+
+
+@pytest.mark.parametrize("methods, scenes", [
+    (["A"], ["door_ajar"]), (["Quick", "A very long name of a method", "C"], ["door_ajar", "a rather long name of a scene"]),
+    ([f"M{i}" for i in range(11)], ["x", "y", "z"])])
+def test_gains_have_a_dot_an_interval_and_a_number_each(methods, scenes):
+    rows = gain_rows(methods, scenes)
+    rows[-1] |= {"gain_low": None, "gain_high": None}
+    with figures.style():
+        figure = figures.draw_gains(rows, ["PT", *methods], "PT", "Title", "Note.")
+        figure.set_dpi(matplotlib.rcParams["savefig.dpi"])
+        FigureCanvasAgg(figure).draw()
+    axes = figure.axes[0]
+    dots = [line for line in axes.lines if len(line.get_xdata()) == 1]
+    assert [line.get_xdata()[0] for line in dots] == [row["gain"] for row in rows]
+    assert len(axes.lines) == 1 + len(rows) + len(rows) - 1             # 1, dots, intervals
+    texts = [text.get_text() for text in visible_texts(figure)]
+    assert texts.count("1.00 (1.00\N{EN DASH}1.00)") == len(scenes) - (len(methods) == 1)
+    low, high = axes.get_xlim()
+    assert low < 1 < high and axes.get_xscale() == "log"
+    renderer, (width, height) = figure.canvas.get_renderer(), figure.canvas.get_width_height()
+    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in visible_texts(figure)]
+    for text, box in boxes:
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height, f"{text!r} is cut off"
+    for (text, box), (other, other_box) in itertools.combinations(boxes, 2):
+        assert not box.padded(-0.5).overlaps(other_box.padded(-0.5)), f"{text!r} lies on {other!r}"
+
+
+def test_gains_from_a_results_folder(finished):
+    summarised = summary.summarise(finished.experiment, finished.results, finished.references)
+    assert figures.gains(finished.results, finished.experiment, summarised)
+    assert imread(finished.results.folder / "gains.png").std() > 10
+    assert (finished.results.folder / "gains.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_no_gains_without_another_method_or_seed(finished, tmp_path):
+    alone = [row for row in summary.summarise(finished.experiment, finished.results, finished.references)["rows"]
+             if row["method"] == "Path tracing"]
+    one_seed = [{"scene": "door_ajar", "method": method, "gain": None} for method in ("Path tracing", "Quick & dirty")]
+    for rows in (alone, one_seed):
+        assert not figures.gains(finished.results, finished.experiment, {"rows": rows}, tmp_path)
+    assert not list(tmp_path.glob("gains.*"))
+
+
+def test_scenes_without_reference_are_left_out(finished, tmp_path):
+    scene = finished.experiment.scene[0]
+    bare = config.Scene(name="cornell_box", width=scene.width, height=scene.height, reference=config.NO_REFERENCE)
+    both = finished.experiment.model_copy(update={"scene": [scene, bare]})
+    for cell in both.cells():
+        folder = finished.results.cell_folder(cell.scene.name, cell.method.name, cell.seed)
+        if cell.scene is bare:
+            shutil.copytree(finished.results.cell_folder(scene.name, cell.method.name, cell.seed), folder)
+            (folder / "cell.json").write_text(json.dumps(json.loads((folder / "cell.json").read_text()) | {"key": cell.key}))
+    for experiment, out in ((finished.experiment, "one"), (both, "both")):
+        figures.curves(finished.results, experiment, finished.references, tmp_path / out)
+        sheet.sheet(finished.results, experiment, finished.references, tmp_path / out)
+    for name in ("figure.png", "sheet.png"):
+        assert imread(tmp_path / "both" / name).shape == imread(tmp_path / "one" / name).shape
 
 
 def test_refuses_to_draw_with_a_missing_cell_and_names_the_command(finished):
