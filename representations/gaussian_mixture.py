@@ -32,6 +32,7 @@ class GaussianMixtureState:
     lobes: mi.Float         # [n_records * 6 * K] weight, mean_x, mean_y, r_xx, r_xy, r_yy, K of each; 0: untrained
     moments: mi.Float       # [n_records * 4 * K] mass, d_xx, d_xy, d_yy, K of each
     mean_weight: mi.Float   # [n_records] running mean of the particles' weights
+    squares: mi.Float       # [n_records] sum of the squared shares of particles in the moments
     visits: mi.UInt32       # [n_records] k of the step size; 0: untrained
     count: mi.UInt32        # [n_records] particles that wait
     waiting: mi.Float       # [n_records * first_fit * 3] their points on the square and weights
@@ -86,7 +87,7 @@ class GaussianMixture:
         state = GaussianMixtureState(
             lobes=dr.zeros(mi.Float, n_records * LOBE_FIELDS * self.components),
             moments=dr.zeros(mi.Float, n_records * MOMENT_FIELDS * self.components),
-            mean_weight=dr.zeros(mi.Float, n_records), visits=dr.zeros(mi.UInt32, n_records),
+            mean_weight=dr.zeros(mi.Float, n_records), squares=dr.zeros(mi.Float, n_records), visits=dr.zeros(mi.UInt32, n_records),
             count=dr.zeros(mi.UInt32, n_records), waiting=dr.zeros(mi.Float, n_records * self.first_fit * 3))
         dr.make_opaque(state)
         return state
@@ -116,7 +117,7 @@ class GaussianMixture:
             return p.x, p.y, p.z
 
         new = replace(state, lobes=dr.empty(mi.Float, len(state.lobes)), moments=dr.empty(mi.Float, len(state.moments)),
-                      mean_weight=dr.empty(mi.Float, n), visits=dr.empty(mi.UInt32, n))
+                      mean_weight=dr.empty(mi.Float, n), squares=dr.empty(mi.Float, n), visits=dr.empty(mi.UInt32, n))
         self._store(new, record, *self.em.online(particle, dr.select(trained, count, 0), *self._load(state, record)))
         untrained = ~trained & (count > 0)
         return self._begin(new, batch, begin, count, untrained, seed) if dr.any(untrained) else new
@@ -162,7 +163,7 @@ class GaussianMixture:
         fit = self.em.first_fit(particle, stored + dr.gather(mi.UInt32, count, record),
                                 mi.Float(dr.gather(mi.UInt32, seen, record)), rng)
         new = replace(new, lobes=mi.Float(new.lobes), moments=mi.Float(new.moments),
-                      mean_weight=mi.Float(new.mean_weight), visits=mi.UInt32(new.visits))
+                      mean_weight=mi.Float(new.mean_weight), squares=mi.Float(new.squares), visits=mi.UInt32(new.visits))
         self._store(new, record, *fit)
         return new
 
@@ -170,7 +171,8 @@ class GaussianMixture:
         shape = (MOMENT_FIELDS * self.components, dr.width(record))
         mass, d_xx, d_xy, d_yy = self._fields(dr.gather(mi.ArrayXf, state.moments, record, shape=shape))
         return self._lobes(state, record, True), Statistics(
-            mass, d_xx, d_xy, d_yy, dr.gather(mi.Float, state.mean_weight, record), dr.gather(mi.UInt32, state.visits, record))
+            mass, d_xx, d_xy, d_yy, dr.gather(mi.Float, state.mean_weight, record), dr.gather(mi.Float, state.squares, record),
+            dr.gather(mi.UInt32, state.visits, record))
 
     def _store(self, state: GaussianMixtureState, record: mi.UInt32, lobes: Lobes, statistics: Statistics) -> None:
         """Write to the arrays of `state`, which must be our own.  One evaluation: the loop behind the values runs once."""
@@ -178,6 +180,7 @@ class GaussianMixture:
         dr.scatter(state.lobes, _concatenate(l.weight, l.mean_x, l.mean_y, l.r_xx, l.r_xy, l.r_yy), record)
         dr.scatter(state.moments, _concatenate(s.mass, s.d_xx, s.d_xy, s.d_yy), record)
         dr.scatter(state.mean_weight, s.mean_weight, record)
+        dr.scatter(state.squares, s.squares, record)
         dr.scatter(state.visits, s.visits, record)
         dr.eval(state)
 

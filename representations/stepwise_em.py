@@ -4,7 +4,12 @@ On-line EM (Cappé & Moulines 2009; "stepwise" in Liang & Klein 2009) as Vorba e
 running statistics by a step eta = (k + 1)^-alpha, every tenth sets the mixture to their maximum a posteriori.
 A first fit sweeps its particles until the likelihood settles; later batches are swept once and forgotten.
 
-Two changes of form, none of substance.  *Relative statistics*: u_j, m_j and S_j are kept divided by the mean
+One change of substance.  The M-step's n is not the number of visits but the *effective number* of particles in the
+statistics, (sum of shares)^2 / sum of squared shares: on-line EM forgets, and weights differ.  And the prior's b
+grows with the dispersion of the weights, as (1 + D)^2: heavy particles are noisy estimates, to which lobes would shrink.  For
+estimates from camera paths (D about 4) this is worth .06 in mean ln pdf, as much as twice the components; equal weights keep b.
+
+Two changes of form.  *Relative statistics*: u_j, m_j and S_j are kept divided by the mean
 weight wbar, so that they are of order one whatever the unit of flux:
 
     wbar' = (1 - eta) wbar + eta w,  rho = eta w / wbar',  u_j' = (1 - rho) u_j + rho gamma_j,  and so on.
@@ -53,6 +58,7 @@ class Statistics:
     d_xy: mi.ArrayXf
     d_yy: mi.ArrayXf
     mean_weight: mi.Float   # wbar [n], in the unit of the particles' weights
+    squares: mi.Float       # sum of the squared shares that particles have in the statistics [n]; 1 / their effective number
     visits: mi.UInt32       # k [n]
 
 
@@ -161,7 +167,7 @@ class StepwiseEM:
         zero = dr.zeros(mi.ArrayXf, shape)
         return (Lobes(mass, mean_x, mean_y, r, zero, mi.ArrayXf(r)),
                 Statistics(mi.ArrayXf(mass), mass * variance, mi.ArrayXf(zero), mass * variance, mi.Float(mean_weight),
-                           dr.full(mi.UInt32, INITIAL_VISITS, lanes)))
+                           dr.full(mi.Float, 1 / INITIAL_VISITS, lanes), dr.full(mi.UInt32, INITIAL_VISITS, lanes)))
 
     @dr.syntax
     def _step(self, particles: Particles, first: mi.UInt32, count: mi.UInt32, lobes: Lobes, statistics: Statistics,
@@ -188,7 +194,7 @@ class StepwiseEM:
 
         mass, d_xx, d_xy, d_yy = statistics.mass, statistics.d_xx, statistics.d_xy, statistics.d_yy
         m_x, m_y = dr.zeros(mi.ArrayXf, dr.shape(mass)), dr.zeros(mi.ArrayXf, dr.shape(mass))
-        total, likelihood, weights = mi.Float(1), mi.Float(0), mi.Float(0)
+        total, squares, likelihood, weights = mi.Float(1), mi.Float(statistics.squares), mi.Float(0), mi.Float(0)
         k, keep = mi.Float(statistics.visits + 1), mi.Float(1)
         eta = dr.exp2(-self.alpha * dr.log2(k))
         q, left = mi.UInt32(0), mi.UInt32(count)
@@ -206,6 +212,7 @@ class StepwiseEM:
                 keep *= dr.select(w > 0, 1 - eta, 1)
                 step = eta * w / keep
                 total += step
+                squares = dr.fma(step, step, squares)
                 c = p * (step / p_sum)
                 c_x, c_y = c * r_x, c * r_y
                 mass = mass + c
@@ -225,8 +232,9 @@ class StepwiseEM:
         statistics = Statistics(
             mass * norm, norm * dr.maximum(dr.fma(-m_x, shift_x, d_xx), 0), norm * dr.fma(-m_x, shift_y, d_xy),
             norm * dr.maximum(dr.fma(-m_y, shift_y, d_yy), 0),
-            statistics.mean_weight * keep * total, statistics.visits + mi.UInt32(k - mi.Float(statistics.visits + 1) + .5))
-        n = mi.Float(statistics.visits)
+            statistics.mean_weight * keep * total, dr.square(norm) * squares,
+            statistics.visits + mi.UInt32(k - mi.Float(statistics.visits + 1) + .5))
+        n = dr.rcp(statistics.squares)
         mode = self._maximise(statistics, n if limit is None else dr.minimum(n, limit), lobes.mean_x + shift_x,
                               lobes.mean_y + shift_y)
         lobes = dr.select(total > 1, mode, lobes)        # nothing learnt: keep the density
@@ -236,8 +244,11 @@ class StepwiseEM:
         """M-step: the posterior's mode under an inverse Wishart (a, b) and a Dirichlet (v) prior, n observations."""
         evidence = n * statistics.mass
         scale = dr.rcp(self.a - 2 + evidence)
-        s_xx = dr.fma(n, statistics.d_xx, self.b) * scale
-        s_yy = dr.fma(n, statistics.d_yy, self.b) * scale
+        # Equal weights would make 2 / eta - 1 effective particles; `ratio` is 1 + the dispersion of the weights
+        ratio = dr.maximum((2 * mi.Float(statistics.visits) ** self.alpha - 1) * statistics.squares, 1)
+        b = self.b * dr.square(ratio)
+        s_xx = dr.fma(n, statistics.d_xx, b) * scale
+        s_yy = dr.fma(n, statistics.d_yy, b) * scale
         s_xy = n * statistics.d_xy * scale
         # Eigenvalues centre +- radius, raised to the floor with the eigenvectors kept
         centre, half = 0.5 * (s_xx + s_yy), 0.5 * (s_xx - s_yy)

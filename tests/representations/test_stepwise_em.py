@@ -24,6 +24,7 @@ class Transcript:
     u: np.ndarray           # [K]
     m: np.ndarray           # [K, 2]
     S: np.ndarray           # [K, 2, 2]
+    squares: float          # sum of the squared shares of the particles
     k: int
 
     def log_joint(self, s: np.ndarray) -> np.ndarray:
@@ -51,14 +52,17 @@ class Transcript:
                 self.m = (1 - eta) * self.m + eta * w * gamma[:, None] * s
                 self.S = (1 - eta) * self.S + eta * w * gamma[:, None, None] * np.outer(s, s)
                 self.k += 1
-            self.maximise(min(self.k, limit))
+                share = eta * w / self.wbar
+                self.squares = (1 - share) ** 2 * self.squares + share ** 2
+            self.maximise(min(1 / self.squares, limit))
         return total / mass
 
     def maximise(self, n: float) -> None:
         self.mu = self.m / self.u[:, None]
         cross = np.einsum("ki,kj->kij", self.m, self.mu)
         D = self.S - cross - cross.transpose(0, 2, 1) + np.einsum("k,ki,kj->kij", self.u, self.mu, self.mu)
-        self.sigma = (B * np.eye(2) + n * D / self.wbar) / ((A - 2) + n * self.u / self.wbar)[:, None, None]
+        b = B * max((2 * self.k ** ALPHA - 1) * self.squares, 1) ** 2
+        self.sigma = (b * np.eye(2) + n * D / self.wbar) / ((A - 2) + n * self.u / self.wbar)[:, None, None]
         values, vectors = np.linalg.eigh(self.sigma)
         self.sigma = np.einsum("kij,kj,klj->kil", vectors, np.maximum(values, FLOOR), vectors)
         self.pi = (n * self.u / self.wbar + (V - 1)) / (n + len(self.u) * (V - 1))
@@ -74,7 +78,7 @@ def transcript_of(lobes: Lobes, statistics: Statistics, record: int) -> Transcri
     D = np.stack([np.stack([d_xx, d_xy], -1), np.stack([d_xy, d_yy], -1)], -2)
     second = D + mass[:, None, None] * np.einsum("ki,kj->kij", mu, mu)
     return Transcript(weight, mu, np.linalg.inv(np.einsum("kji,kjl->kil", R, R)), wbar, wbar * mass, wbar * mass[:, None] * mu,
-                      wbar * second, int(np.array(statistics.visits)[record]))
+                      wbar * second, float(np.array(statistics.squares)[record]), int(np.array(statistics.visits)[record]))
 
 
 def points_and_weights(n_records: int, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
