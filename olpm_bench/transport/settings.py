@@ -48,7 +48,7 @@ class IntegratorSettings:
     max_depth: int = 13
     roulette: Literal["contribution", "throughput", "none"] = "contribution"
     rr_depth: int = 5
-    window: float = 0.5
+    window: float = 0.25
     fraction: float = 0.5
 
     def __post_init__(self) -> None:
@@ -94,7 +94,7 @@ class TrainingSettings:
     passes: int = 3
     photons: int = 300_000
     importons: int = 100_000
-    camera_passes: int = 24
+    camera_passes: int = 64
     camera_paths: int = 2 ** 17
     share: float | Literal["auto"] = 0.35
     blend: bool = True
