@@ -34,7 +34,7 @@ class GuidedBSDF:
 
     Attributes:
         outgoing: mean radiance (luminance) that the record's surface returns, without next-event estimation; < 0: not known.
-        chosen_by_bsdf: of the last sample, the probability that the BSDF chose it, c p_bsdf / p; -1 where c = 1.
+        chosen_by_bsdf: of the last sample, the probability that the BSDF chose it, c p_bsdf / p; -1 where c = 1 or it failed.
     """
 
     def __init__(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, guide: Guide | None, fraction: float,
@@ -103,5 +103,5 @@ class GuidedBSDF:
         bs.sampled_type = dr.select(choose_bsdf, bs.sampled_type, mi.UInt32(+mi.BSDFFlags.GlossyReflection))
         bs.pdf = dr.select(specular, bsdf_pdf * self.fraction, self._mixture_pdf(bsdf_pdf, bs.wo))
         weight = dr.select(specular, weight / self.fraction, dr.select(bs.pdf > 0, value / bs.pdf, 0))
-        self.chosen_by_bsdf = dr.select(self.guided.valid, self.fraction * bsdf_pdf / bs.pdf, -1)
+        self.chosen_by_bsdf = dr.select(self.guided.valid & (bs.pdf > 0), self.fraction * bsdf_pdf / bs.pdf, -1)
         return bs, weight & active

@@ -12,6 +12,7 @@ from small_scenes import box, grey, lamp
 import olpm_bench
 import representations
 from olpm_bench.transport import settings
+from olpm_bench.transport.estimates import FLOOR
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.training import Training, train
 from representations import state as states
@@ -41,6 +42,9 @@ def test_guides_learn_on_line(scene, name):
     assert all(s.stored > 10_000 and 0 < s.kept <= s.stored for s in seen)
     assert guide.particles == sum(s.kept for s in seen)
     assert guide.records == seen[-1].records > 100
+    enough, fraction, outgoing, _ = guide.rows.numpy().reshape(-1, 4).T
+    assert set(enough) <= {0, 1} and enough.mean() == pytest.approx(guide.trained) and (outgoing != 0).all()
+    assert fraction.min() >= FLOOR - 1e-6 and fraction.max() <= 1 - FLOOR + 1e-6 and fraction.std() > 0.01
     assert np.mean(guide.count.numpy() >= 40) > 0.8
 
 
