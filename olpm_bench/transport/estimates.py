@@ -149,7 +149,7 @@ def _fraction_sums(weight: mi.Float, gamma: mi.Float, offset: mi.UInt32, most: m
         g = dr.gather(mi.Float, gamma, i)
         w = dr.select(g >= 0, dr.minimum(dr.gather(mi.Float, weight, i), most), 0)
         either += w
-        bsdf += w * g
+        bsdf += dr.select(g >= 0, w * g, 0)
         i += stride
     dr.eval(either, bsdf)
     return either, bsdf
