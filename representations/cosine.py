@@ -33,7 +33,7 @@ class CosineState:
 class CosineLobe:
     """p(wo) = cos(theta) / pi, whatever the particles."""
 
-    def init(self, n_records: int, seed: int = 0) -> CosineState:
+    def init(self, n_records: int, seed: int = 0, parallax: bool = False) -> CosineState:
         return CosineState(dr.zeros(mi.UInt32, n_records))
 
     def update(self, state: CosineState, batch: ParticleBatch, seed: int = 0) -> CosineState:
@@ -42,8 +42,9 @@ class CosineLobe:
         return CosineState(state.count + batch.count())
 
     def sample(self, state: CosineState, record: mi.UInt32, sample1: mi.Float, sample2: mi.Point2f,
-               active: mi.Bool = True) -> tuple[mi.Vector3f, mi.Float]:
+               active: mi.Bool = True, at: mi.Vector3f | None = None) -> tuple[mi.Vector3f, mi.Float]:
         return sample_cosine(sample2)
 
-    def pdf(self, state: CosineState, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
+    def pdf(self, state: CosineState, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True,
+            at: mi.Vector3f | None = None) -> mi.Float:
         return cosine_pdf(wo)

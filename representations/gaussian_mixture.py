@@ -5,6 +5,9 @@
 As in the paper the Gaussians are not cut at the square's border: a sample beyond it fails, about 1 % of them once a record
 is trained, and the integral of the density over the hemisphere is below 1 by as much.  Our choice: until a record has
 seen `first_fit` particles it keeps them and is the cosine lobe.  :mod:`representations.stepwise_em` does the learning.
+
+Parallax (Ruppert et al. 2020): a component learns the harmonic mean t_j of its particles' distances, and from a point `at`
+its mean direction d_j is that of t_j d_j - at; the covariance on the square stays.
 """
 from __future__ import annotations
 
@@ -18,11 +21,13 @@ import mitsuba as mi
 from representations import square
 from representations.cosine import cosine_pdf, sample_cosine
 from representations.interface import ParticleBatch
+from representations.parallax import aim
 from representations.state import join
 from representations.stepwise_em import EXPONENT, Lobes, Particle, Statistics, StepwiseEM, exp2_negative
 
 LOBE_FIELDS = 6             # arrays of Lobes
-MOMENT_FIELDS = 4           # arrays of Statistics with an entry for every component
+MOMENT_FIELDS = 4           # arrays of Statistics with an entry for every component, but for `near`
+AIM_FIELDS = 4
 GAUSSIAN = square.TO_SOLID_ANGLE / (2 * dr.pi * EXPONENT)      # density of one lobe at its mean, times 1 / |R| [1/sr]
 
 
@@ -30,12 +35,13 @@ GAUSSIAN = square.TO_SOLID_ANGLE / (2 * dr.pi * EXPONENT)      # density of one 
 class GaussianMixtureState:
     """Of each record: K lobes for queries, what EM remembers besides, the particles that wait for the first fit."""
     lobes: mi.Float         # [n_records * 6 * K] weight, mean_x, mean_y, r_xx, r_xy, r_yy, K of each; 0: untrained
+    aims: mi.Float          # [n_records * 4 * K] direction of the mean x, y, z and 1 / distance, K of each; empty: no parallax
     moments: mi.Float       # [n_records * 4 * K] mass, d_xx, d_xy, d_yy, K of each
     mean_weight: mi.Float   # [n_records] running mean of the particles' weights
     squares: mi.Float       # [n_records] sum of the squared shares of particles in the moments
     visits: mi.UInt32       # [n_records] k of the step size; 0: untrained
     count: mi.UInt32        # [n_records] particles that wait
-    waiting: mi.Float       # [n_records * first_fit * 3] their points on the square and weights
+    waiting: mi.Float       # [n_records * first_fit * 3] their points on the square and weights; 4 with parallax: 1 / distances
 
 
 class GaussianMixture:
@@ -83,12 +89,14 @@ class GaussianMixture:
 
     # ---- State
 
-    def init(self, n_records: int, seed: int = 0) -> GaussianMixtureState:
+    def init(self, n_records: int, seed: int = 0, parallax: bool = False) -> GaussianMixtureState:
         state = GaussianMixtureState(
             lobes=dr.zeros(mi.Float, n_records * LOBE_FIELDS * self.components),
+            aims=dr.zeros(mi.Float, n_records * AIM_FIELDS * self.components if parallax else 0),
             moments=dr.zeros(mi.Float, n_records * MOMENT_FIELDS * self.components),
-            mean_weight=dr.zeros(mi.Float, n_records), squares=dr.zeros(mi.Float, n_records), visits=dr.zeros(mi.UInt32, n_records),
-            count=dr.zeros(mi.UInt32, n_records), waiting=dr.zeros(mi.Float, n_records * self.first_fit * 3))
+            mean_weight=dr.zeros(mi.Float, n_records), squares=dr.zeros(mi.Float, n_records),
+            visits=dr.zeros(mi.UInt32, n_records), count=dr.zeros(mi.UInt32, n_records),
+            waiting=dr.zeros(mi.Float, n_records * self.first_fit * (4 if parallax else 3)))
         dr.make_opaque(state)
         return state
 
@@ -107,28 +115,29 @@ class GaussianMixture:
         begin = dr.gather(mi.UInt32, batch.offset, record)
         count = dr.gather(mi.UInt32, batch.offset, record + 1) - begin
         trained = state.visits > 0
-        # Point and weight side by side: one load a particle instead of four gathers
-        s = square.from_hemisphere(batch.wo)
-        points = dr.ravel(mi.Vector4f(s.x, s.y, batch.weight, 0))
+        # Side by side: one load a particle instead of four gathers
+        wo, inverse_distance = batch.aimed() if len(state.aims) else (batch.wo, mi.Float(0))
+        s = square.from_hemisphere(wo)
+        points = dr.ravel(mi.Vector4f(s.x, s.y, batch.weight, inverse_distance))
         dr.eval(points)
 
         def particle(i: mi.UInt32) -> Particle:
             p = dr.gather(mi.Vector4f, points, begin + i)
-            return p.x, p.y, p.z
+            return p.x, p.y, p.z, p.w
 
-        new = replace(state, lobes=dr.empty(mi.Float, len(state.lobes)), moments=dr.empty(mi.Float, len(state.moments)),
+        new = replace(state, lobes=dr.empty(mi.Float, len(state.lobes)), aims=dr.empty(mi.Float, len(state.aims)),
+                      moments=dr.empty(mi.Float, len(state.moments)),
                       mean_weight=dr.empty(mi.Float, n), squares=dr.empty(mi.Float, n), visits=dr.empty(mi.UInt32, n))
         self._store(new, record, *self.em.online(particle, dr.select(trained, count, 0), *self._load(state, record)))
         untrained = ~trained & (count > 0)
-        return self._begin(new, batch, begin, count, untrained, seed) if dr.any(untrained) else new
+        return self._begin(new, batch, points, begin, count, untrained, seed) if dr.any(untrained) else new
 
-    def _begin(self, state: GaussianMixtureState, batch: ParticleBatch, begin: mi.UInt32, count: mi.UInt32,
-               untrained: mi.Bool, seed: int) -> GaussianMixtureState:
+    def _begin(self, state: GaussianMixtureState, batch: ParticleBatch, points: mi.Float, begin: mi.UInt32,
+               count: mi.UInt32, untrained: mi.Bool, seed: int) -> GaussianMixtureState:
         """First fits, for the records that have enough particles by now; the others' particles join those that wait."""
-        s = square.from_hemisphere(batch.wo)
         heavy = batch.weight > 0
         rank = dr.prefix_sum(join(dr.select(heavy, mi.UInt32(1), 0), dr.zeros(mi.UInt32, 1)))
-        dr.eval(s, heavy, rank)
+        dr.eval(heavy, rank)
         rank_begin = dr.gather(mi.UInt32, rank, begin)
         seen = state.count + dr.gather(mi.UInt32, rank, begin + count) - rank_begin
         ready = untrained & (seen >= self.first_fit)
@@ -138,7 +147,9 @@ class GaussianMixture:
         waiting = mi.Float(state.waiting)
         slot = dr.gather(mi.UInt32, state.count, batch.record) + (
             dr.gather(mi.UInt32, rank, dr.arange(mi.UInt32, len(batch))) - dr.gather(mi.UInt32, rank_begin, batch.record))
-        dr.scatter(waiting, mi.Vector3f(s.x, s.y, batch.weight), batch.record * self.first_fit + slot,
+        entry = mi.Vector4f if len(state.aims) else mi.Vector3f
+        fresh = dr.gather(mi.Vector4f, points, dr.arange(mi.UInt32, len(batch)))
+        dr.scatter(waiting, entry(*list(fresh)[:dr.size_v(entry)]), batch.record * self.first_fit + slot,
                    heavy & dr.gather(mi.Bool, keep, batch.record))
         new.waiting = waiting
         dr.eval(new)
@@ -152,17 +163,16 @@ class GaussianMixture:
 
         def particle(i: mi.UInt32) -> Particle:
             old, slot = i < stored, record * self.first_fit + i
-            w = dr.gather(mi.Vector3f, state.waiting, slot, old)
-            fresh = first + i - stored
-            p = dr.gather(mi.Point2f, s, fresh, ~old)
-            return (dr.select(old, w.x, p.x), dr.select(old, w.y, p.y),
-                    dr.select(old, w.z, dr.gather(mi.Float, batch.weight, fresh, ~old)))
+            p = dr.gather(mi.Vector4f, points, first + i - stored, ~old)
+            w = dr.gather(entry, state.waiting, slot, old)
+            return (dr.select(old, w.x, p.x), dr.select(old, w.y, p.y), dr.select(old, w.z, p.z),
+                    dr.select(old, w.w, p.w) if len(state.aims) else p.w)
 
         state_bits, stream_bits = mi.sample_tea_32(record, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), rounds=8)
         rng = mi.PCG32(initstate=mi.UInt64(state_bits), initseq=mi.UInt64(stream_bits))
         fit = self.em.first_fit(particle, stored + dr.gather(mi.UInt32, count, record),
-                                mi.Float(dr.gather(mi.UInt32, seen, record)), rng)
-        new = replace(new, lobes=mi.Float(new.lobes), moments=mi.Float(new.moments),
+                                mi.Float(dr.gather(mi.UInt32, seen, record)), rng, len(state.aims) > 0)
+        new = replace(new, lobes=mi.Float(new.lobes), aims=mi.Float(new.aims), moments=mi.Float(new.moments),
                       mean_weight=mi.Float(new.mean_weight), squares=mi.Float(new.squares), visits=mi.UInt32(new.visits))
         self._store(new, record, *fit)
         return new
@@ -170,24 +180,41 @@ class GaussianMixture:
     def _load(self, state: GaussianMixtureState, record: mi.UInt32) -> tuple[Lobes, Statistics]:
         shape = (MOMENT_FIELDS * self.components, dr.width(record))
         mass, d_xx, d_xy, d_yy = self._fields(dr.gather(mi.ArrayXf, state.moments, record, shape=shape))
-        return self._lobes(state, record, True), Statistics(
-            mass, d_xx, d_xy, d_yy, dr.gather(mi.Float, state.mean_weight, record), dr.gather(mi.Float, state.squares, record),
-            dr.gather(mi.UInt32, state.visits, record))
+        near = None
+        if len(state.aims):
+            *_, inverse_distance = self._aims(state, record, True)
+            near = mass * inverse_distance
+        return self._lobes(state, record, True, None), Statistics(
+            mass, d_xx, d_xy, d_yy, near, dr.gather(mi.Float, state.mean_weight, record),
+            dr.gather(mi.Float, state.squares, record), dr.gather(mi.UInt32, state.visits, record))
 
     def _store(self, state: GaussianMixtureState, record: mi.UInt32, lobes: Lobes, statistics: Statistics) -> None:
         """Write to the arrays of `state`, which must be our own.  One evaluation: the loop behind the values runs once."""
         l, s = lobes, statistics
         dr.scatter(state.lobes, _concatenate(l.weight, l.mean_x, l.mean_y, l.r_xx, l.r_xy, l.r_yy), record)
+        if s.near is not None:
+            d = [square.to_hemisphere(dr.clip(mi.Point2f(mean), 0, 1)) for mean in zip(l.mean_x, l.mean_y, strict=True)]
+            dr.scatter(state.aims, _concatenate(*zip(*d, strict=True), s.near / dr.maximum(s.mass, 1e-30)), record)
         dr.scatter(state.moments, _concatenate(s.mass, s.d_xx, s.d_xy, s.d_yy), record)
         dr.scatter(state.mean_weight, s.mean_weight, record)
         dr.scatter(state.squares, s.squares, record)
         dr.scatter(state.visits, s.visits, record)
         dr.eval(state)
 
-    def _lobes(self, state: GaussianMixtureState, record: mi.UInt32, active: mi.Bool) -> Lobes:
-        """All lobes of a record in one packet gather; r = 0 where it is untrained."""
+    def _lobes(self, state: GaussianMixtureState, record: mi.UInt32, active: mi.Bool, at: mi.Vector3f | None) -> Lobes:
+        """All lobes of a record in one packet gather, as seen from `at`; r = 0 where it is untrained."""
         shape = (LOBE_FIELDS * self.components, dr.width(record))
-        return Lobes(*self._fields(dr.gather(mi.ArrayXf, state.lobes, record, active, shape=shape)))
+        lobes = Lobes(*self._fields(dr.gather(mi.ArrayXf, state.lobes, record, active, shape=shape)))
+        if at is not None and len(state.aims):
+            x, y, z, inverse_distance = self._aims(state, record, active)
+            x, y, z, _ = aim((x, y, z), inverse_distance, at)
+            lobes.mean_x, lobes.mean_y = square.components_from_hemisphere(x, y, z)
+        return lobes
+
+    def _aims(self, state: GaussianMixtureState, record: mi.UInt32, active: mi.Bool) -> Iterator[mi.ArrayXf]:
+        """Directions of the means, and 1 / their distances."""
+        shape = (AIM_FIELDS * self.components, dr.width(record))
+        return self._fields(dr.gather(mi.ArrayXf, state.aims, record, active, shape=shape))
 
     def _fields(self, packet: mi.ArrayXf) -> Iterator[mi.ArrayXf]:
         k = self.components
@@ -196,8 +223,8 @@ class GaussianMixture:
     # ---- Density
 
     def sample(self, state: GaussianMixtureState, record: mi.UInt32, sample1: mi.Float, sample2: mi.Point2f,
-               active: mi.Bool = True) -> tuple[mi.Vector3f, mi.Float]:
-        lobes = self._lobes(state, record, active)
+               active: mi.Bool = True, at: mi.Vector3f | None = None) -> tuple[mi.Vector3f, mi.Float]:
+        lobes = self._lobes(state, record, active, at)
         trained = lobes.r_xx[0] > 0
         # Choose a component by sample1, then solve R (s - mean) = z for a standard normal z
         chosen = [field[0] for field in (lobes.mean_x, lobes.mean_y, lobes.r_xx, lobes.r_xy, lobes.r_yy)]
@@ -217,8 +244,9 @@ class GaussianMixture:
         wo_cosine, pdf_cosine = sample_cosine(sample2)
         return dr.select(trained, wo, wo_cosine), dr.select(trained, pdf, pdf_cosine)
 
-    def pdf(self, state: GaussianMixtureState, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
-        lobes = self._lobes(state, record, active)
+    def pdf(self, state: GaussianMixtureState, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True,
+            at: mi.Vector3f | None = None) -> mi.Float:
+        lobes = self._lobes(state, record, active, at)
         pdf = dr.select(lobes.r_xx[0] > 0, _density(lobes, square.from_hemisphere(wo)), cosine_pdf(wo))
         return dr.select(wo.z > 0, pdf, 0)
 

@@ -17,6 +17,7 @@ import mitsuba as mi
 from representations import discrete
 from representations.cosine import cosine_pdf, sample_cosine
 from representations.interface import ParticleBatch
+from representations.parallax import aim
 from representations.state import join
 
 GRID = 64                   # cells along each side of the square around the projected hemisphere
@@ -32,6 +33,7 @@ class HeyState:
     weight: mi.Float        # [n_records * cones] of the particles kept; 0 in free slots, which are the last ones
     cumulative: mi.Float    # [n_records * cones] inclusive sum of `weight` over the slots of a record
     cone: mi.Float          # [n_records * cones * 4] axis (x, y, z), chord^2: wo is inside if |wo - axis|^2 < chord^2
+    near: mi.Float          # [n_records * cones] 1 / distance of where the particle came from; empty without parallax
 
 
 class HeyCones:
@@ -48,10 +50,11 @@ class HeyCones:
             raise ValueError(f"cones = {cones!r}: must be in 1 .. 4096")
         self.cones = cones
 
-    def init(self, n_records: int, seed: int = 0) -> HeyState:
+    def init(self, n_records: int, seed: int = 0, parallax: bool = False) -> HeyState:
         n = n_records * self.cones
         return HeyState(seen=dr.zeros(mi.UInt32, n_records), weight=dr.zeros(mi.Float, n),
-                        cumulative=dr.zeros(mi.Float, n), cone=dr.zeros(mi.Float, 4 * n))
+                        cumulative=dr.zeros(mi.Float, n), cone=dr.zeros(mi.Float, 4 * n),
+                        near=dr.zeros(mi.Float, n if parallax else 0))
 
     def update(self, state: HeyState, batch: ParticleBatch, seed: int = 0) -> HeyState:
         """Add a batch.
@@ -64,45 +67,57 @@ class HeyCones:
             raise ValueError(f"a batch of {batch.n_records} records for a state of {n_records}")
         if len(batch) == 0:
             return state
+        wo, inverse_distance = batch.aimed() if len(state.near) else (batch.wo, None)
         newcomer, seen = self._reservoir(state.seen, batch, seed)
         replaced = newcomer > 0
         kept = dr.gather(mi.Vector4f, state.cone, dr.arange(mi.UInt32, len(newcomer)))
-        axis = dr.select(replaced, dr.gather(mi.Vector3f, batch.wo, newcomer - 1, replaced), mi.Vector3f(kept.xyz))
+        axis = dr.select(replaced, dr.gather(mi.Vector3f, wo, newcomer - 1, replaced), mi.Vector3f(kept.xyz))
         weight = dr.select(replaced, dr.gather(mi.Float, batch.weight, newcomer - 1, replaced), state.weight)
-        dr.eval(axis, weight, seen)
+        near = state.near if inverse_distance is None else dr.select(
+            replaced, dr.gather(mi.Float, inverse_distance, newcomer - 1, replaced), state.near)
+        dr.eval(axis, weight, near, seen)
         chord2 = self._chord2(axis, weight > 0, n_records)
         return HeyState(seen=seen, weight=weight, cumulative=discrete.accumulate(weight, self.cones),
-                        cone=dr.ravel(mi.Vector4f(axis.x, axis.y, axis.z, chord2)))
+                        cone=dr.ravel(mi.Vector4f(axis.x, axis.y, axis.z, chord2)), near=near)
 
     def sample(self, state: HeyState, record: mi.UInt32, sample1: mi.Float, sample2: mi.Point2f,
-               active: mi.Bool = True) -> tuple[mi.Vector3f, mi.Float]:
+               active: mi.Bool = True, at: mi.Vector3f | None = None) -> tuple[mi.Vector3f, mi.Float]:
         total = discrete.total(state.cumulative, self.cones, record, active)
         chosen = discrete.choose(state.cumulative, self.cones, record, sample1 * total, active)
-        cone = dr.gather(mi.Vector4f, state.cone, record * self.cones + chosen, active)
+        cone = self._cone(state, record * self.cones + chosen, active, at)
         versine = 0.5 * cone.w * sample2.x              # 1 - cos of the angle to the axis
         sin_phi, cos_phi = dr.sincos(2 * dr.pi * sample2.y)
         sin_alpha = dr.safe_sqrt(versine * (2 - versine))
         local = mi.Vector3f(sin_alpha * cos_phi, sin_alpha * sin_phi, 1 - versine)
         wo = dr.select(total > 0, mi.Frame3f(mi.Vector3f(cone.xyz)).to_world(local), sample_cosine(sample2)[0])
-        return wo, self._density(state, record, wo, total, active)
+        return wo, self._density(state, record, wo, total, active, at)
 
-    def pdf(self, state: HeyState, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
-        return self._density(state, record, wo, discrete.total(state.cumulative, self.cones, record, active), active)
+    def pdf(self, state: HeyState, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True,
+            at: mi.Vector3f | None = None) -> mi.Float:
+        return self._density(state, record, wo, discrete.total(state.cumulative, self.cones, record, active), active, at)
 
     def _density(self, state: HeyState, record: mi.UInt32, wo: mi.Vector3f, total: mi.Float,
-                 active: mi.Bool) -> mi.Float:
+                 active: mi.Bool, at: mi.Vector3f | None) -> mi.Float:
         """Density [1/sr] at `wo` of a record whose particles weigh `total`; a loop over all its cones."""
         first = record * self.cones
         end = first + dr.minimum(dr.gather(mi.UInt32, state.seen, record, active & (wo.z > 0)), self.cones)
 
         def add(i: mi.UInt32, found: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-            cone = dr.gather(mi.Vector4f, state.cone, i)
+            cone = self._cone(state, i, True, at)
             inside = dr.squared_norm(wo - mi.Vector3f(cone.xyz)) < cone.w
             return i + 1, found + dr.gather(mi.Float, state.weight, i, inside) / cone.w
 
         _, found = dr.while_loop((first, mi.Float(0)), lambda i, _: i < end, add, mode="symbolic")
         # Archimedes: the cap of a unit sphere within the chord c of its pole has the area pi c^2.
         return dr.select(total > 0, found / total * dr.inv_pi, cosine_pdf(wo))
+
+    def _cone(self, state: HeyState, i: mi.UInt32, active: mi.Bool, at: mi.Vector3f | None) -> mi.Vector4f:
+        """Axis and squared chord of cone i, as seen from `at`.  What turns below the horizon is lost: those samples fail."""
+        cone = dr.gather(mi.Vector4f, state.cone, i, active)
+        if at is not None and len(state.near):
+            x, y, z, _ = aim((cone.x, cone.y, cone.z), dr.gather(mi.Float, state.near, i, active), at)
+            cone = mi.Vector4f(x, y, z, cone.w)
+        return cone
 
     def _reservoir(self, seen: mi.UInt32, batch: ParticleBatch, seed: int) -> tuple[mi.UInt32, mi.UInt32]:
         """Which particles enter which slots so that every particle seen is equally likely to be kept.

@@ -10,6 +10,10 @@ can append new ones, save, load and count the bytes of any state without knowing
 Sign convention (the only place it is stated): a direction ``wo`` is a unit vector in the record's own frame
 (s, t, n), n = (0, 0, 1), and points *away from the surface*, to where light comes from or importance comes
 from.  Densities are per solid angle [1/sr] and zero for ``wo.z <= 0``.
+
+Parallax: a record is asked about points around its own.  Those who know where say it by ``at``, the point in the record's
+frame, whose origin is the record's position; a representation that knows how far away its light is re-aims it from there
+(Ruppert et al. 2020), others may ignore ``at``.  Without it, all points see what the record sees.
 """
 from __future__ import annotations
 
@@ -20,6 +24,7 @@ import drjit as dr
 import mitsuba as mi
 
 from representations import RepresentationError
+from representations.parallax import aim, inverse
 
 State = TypeVar("State")
 
@@ -35,6 +40,7 @@ class ParticleBatch:
     distance: mi.Float      # [n] length of the particle's last segment [scene units]
     record: mi.UInt32       # [n] ascending
     offset: mi.UInt32       # [n_records + 1]
+    at: mi.Vector3f | None = None       # [n] where it landed, in the record's frame [scene units]; None: at the record itself
 
     @property
     def n_records(self) -> int:
@@ -59,6 +65,13 @@ class ParticleBatch:
             i += 1
         return total
 
+    def aimed(self) -> tuple[mi.Vector3f, mi.Float]:
+        """As seen from the record's position: directions to where the particles came from, and 1 / their distance."""
+        if self.at is None:
+            return self.wo, inverse(self.distance)
+        x, y, z, inverse_distance = aim(self.wo, inverse(self.distance), -self.at)
+        return mi.Vector3f(x, y, z), inverse_distance
+
     @staticmethod
     def empty(n_records: int) -> ParticleBatch:
         """No particles at all."""
@@ -66,7 +79,7 @@ class ParticleBatch:
 
     @staticmethod
     def from_arrays(wo: mi.Vector3f, weight: mi.Float, record: mi.UInt32, n_records: int,
-                    distance: mi.Float | None = None) -> ParticleBatch:
+                    distance: mi.Float | None = None, at: mi.Vector3f | None = None) -> ParticleBatch:
         """Group particles by record with a stable sort; entries with ``record >= n_records`` are left out.
 
         Raises:
@@ -78,7 +91,7 @@ class ParticleBatch:
         batch = ParticleBatch(
             wo=dr.gather(mi.Vector3f, wo, order), weight=dr.gather(mi.Float, weight, order),
             distance=dr.gather(mi.Float, distance, order) if distance is not None else dr.full(mi.Float, dr.inf, len(order)),
-            record=record, offset=offset)
+            record=record, offset=offset, at=dr.gather(mi.Vector3f, at, order) if at is not None else None)
         dr.eval(batch)
         return batch
 
@@ -117,8 +130,11 @@ class DirectionalPdf(Protocol[State]):
     ``pytest tests/representations/test_conformance.py --representation path/to/file.py:ClassName``.
     """
 
-    def init(self, n_records: int, seed: int = 0) -> State:
-        """A state that already is a valid density for every record, before any particle."""
+    def init(self, n_records: int, seed: int = 0, parallax: bool = False) -> State:
+        """A state that already is a valid density for every record, before any particle.
+
+        With `parallax` it learns what it needs to be asked ``at`` points; without, it need spend no memory and time on that.
+        """
         ...
 
     def update(self, state: State, batch: ParticleBatch, seed: int = 0) -> State:
@@ -132,14 +148,15 @@ class DirectionalPdf(Protocol[State]):
         ...
 
     def sample(self, state: State, record: mi.UInt32, sample1: mi.Float, sample2: mi.Point2f,
-               active: mi.Bool = True) -> tuple[mi.Vector3f, mi.Float]:
-        """Map uniform numbers in [0, 1) to ``(wo, pdf)``, with the very density that :meth:`pdf` returns for ``wo``.
+               active: mi.Bool = True, at: mi.Vector3f | None = None) -> tuple[mi.Vector3f, mi.Float]:
+        """Map uniform numbers in [0, 1) to ``(wo, pdf)``, with the very density that :meth:`pdf` returns for ``wo`` and ``at``.
 
         A sample may fail (land outside the hemisphere): its pdf is then 0 and its ``wo`` lies below the horizon, and
         the integral of `pdf` is below 1 by the probability of that.
         """
         ...
 
-    def pdf(self, state: State, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
+    def pdf(self, state: State, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True,
+            at: mi.Vector3f | None = None) -> mi.Float:
         """The density realised by :meth:`sample` [1/sr]: finite, >= 0, 0 for ``wo.z <= 0``, integral <= 1."""
         ...

@@ -2,6 +2,8 @@
 
 Jensen 1995, "Importance driven path tracing using the photon map"; resolution and map of Vorba et al. 2014.
 Empty bins stay empty: in the path tracer the BSDF half of the mixture covers them.
+
+Bins are not re-aimed for parallax: they would overlap, and the density at a point would be a sum over all of them.
 """
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ class JensenHistogram:
         self.resolution = resolution
         self.bins = resolution**2
 
-    def init(self, n_records: int, seed: int = 0) -> JensenState:
+    def init(self, n_records: int, seed: int = 0, parallax: bool = False) -> JensenState:
         n = n_records * self.bins
         return JensenState(mass=dr.zeros(mi.Float, n), cumulative=dr.zeros(mi.Float, n))
 
@@ -66,7 +68,7 @@ class JensenHistogram:
         return JensenState(mass=mass, cumulative=discrete.accumulate(mass, self.bins))
 
     def sample(self, state: JensenState, record: mi.UInt32, sample1: mi.Float, sample2: mi.Point2f,
-               active: mi.Bool = True) -> tuple[mi.Vector3f, mi.Float]:
+               active: mi.Bool = True, at: mi.Vector3f | None = None) -> tuple[mi.Vector3f, mi.Float]:
         total = discrete.total(state.cumulative, self.bins, record, active)
         chosen = discrete.choose(state.cumulative, self.bins, record, sample1 * total, active)
         corner = mi.Point2f(mi.Float(chosen % self.resolution), mi.Float(chosen // self.resolution))
@@ -74,7 +76,8 @@ class JensenHistogram:
         # Rounding may carry `wo` over an edge of its bin, so the density is looked up anew.
         return wo, self._density(state, record, wo, total, active)
 
-    def pdf(self, state: JensenState, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True) -> mi.Float:
+    def pdf(self, state: JensenState, record: mi.UInt32, wo: mi.Vector3f, active: mi.Bool = True,
+            at: mi.Vector3f | None = None) -> mi.Float:
         return self._density(state, record, wo, discrete.total(state.cumulative, self.bins, record, active), active)
 
     def _density(self, state: JensenState, record: mi.UInt32, wo: mi.Vector3f, total: mi.Float,

@@ -4,8 +4,12 @@ The Jacobian is constant: a density on the square is 2 pi times the density per 
 """
 from __future__ import annotations
 
+from typing import Any, TypeVar
+
 import drjit as dr
 import mitsuba as mi
+
+Float = TypeVar("Float", bound=Any)           # mi.Float, or mi.ArrayXf [K, n]
 
 TO_SOLID_ANGLE = 1 / (2 * dr.pi)        # p(omega) = p_square * TO_SOLID_ANGLE  [1/sr]
 
@@ -23,12 +27,17 @@ def to_hemisphere(s: mi.Point2f) -> mi.Vector3f:
 
 def from_hemisphere(wo: mi.Vector3f) -> mi.Point2f:
     """Unit vector with z >= 0 -> square; directions below the horizon land where their mirror image does."""
-    x, y = dr.abs(wo.x), dr.abs(wo.y)
-    r = dr.sqrt(dr.fma(x, x, y * y) * dr.rcp(1 + dr.abs(wo.z)))         # sqrt(1 - |z|), without cancellation
+    return mi.Point2f(*components_from_hemisphere(*wo))
+
+
+def components_from_hemisphere(wo_x: Float, wo_y: Float, wo_z: Float) -> tuple[Float, Float]:
+    """:func:`from_hemisphere`, also of [K, n] components."""
+    x, y = dr.abs(wo_x), dr.abs(wo_y)
+    r = dr.sqrt(dr.fma(x, x, y * y) * dr.rcp(1 + dr.abs(wo_z)))         # sqrt(1 - |z|), without cancellation
     t = dr.minimum(x, y) / dr.maximum(dr.maximum(x, y), 1e-30)          # tangent of the angle within the sector
-    t2, angle = t * t, mi.Float(ARCTAN[-1])
+    t2, angle = t * t, ARCTAN[-1]
     for coefficient in ARCTAN[-2::-1]:
         angle = dr.fma(angle, t2, coefficient)
     across = r * t * angle
     u, v = dr.select(y > x, across, r), dr.select(y > x, r, across)
-    return mi.Point2f(dr.fma(dr.mulsign(u, wo.x), 0.5, 0.5), dr.fma(dr.mulsign(v, wo.y), 0.5, 0.5))
+    return dr.fma(dr.mulsign(u, wo_x), 0.5, 0.5), dr.fma(dr.mulsign(v, wo_y), 0.5, 0.5)

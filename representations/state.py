@@ -31,6 +31,8 @@ def append(state: State, more: State) -> State:
 def copy_records(array: Any, n_records: int, source: Any, target: Any) -> Any:
     """An array in which the records `target` are copies of the records `source` (UInt32 [k], k > 1)."""
     tp, stride = dr.uint32_array_t(type(array)), len(array) // n_records
+    if stride == 0:                         # a field that is not in use
+        return array
     i, stride = dr.arange(tp, len(source) * stride), dr.opaque(tp, stride)
     k, within = i // stride, i % stride
     values = dr.gather(type(array), array, dr.gather(tp, source, k) * stride + within)

@@ -27,7 +27,7 @@ from typing import TypeAlias
 import drjit as dr
 import mitsuba as mi
 
-Particle: TypeAlias = "tuple[mi.Float, mi.Float, mi.Float]"         # its point on the square and its weight
+Particle: TypeAlias = "tuple[mi.Float, mi.Float, mi.Float, mi.Float]"   # point on the square, weight, 1 / distance
 Particles: TypeAlias = "Callable[[mi.UInt32], Particle]"            # particle i of each lane
 
 INITIAL_VISITS = 100        # what the initial mixture counts for, in particles: with 0 it is forgotten in ten [M]
@@ -57,6 +57,7 @@ class Statistics:
     d_xx: mi.ArrayXf        # D_j / wbar [K, n], about the means of the lobes
     d_xy: mi.ArrayXf
     d_yy: mi.ArrayXf
+    near: mi.ArrayXf | None # sum of gamma / distance, as u_j / wbar sums gamma [K, n]: near / mass is 1 / harmonic mean
     mean_weight: mi.Float   # wbar [n], in the unit of the particles' weights
     squares: mi.Float       # sum of the squared shares that particles have in the statistics [n]; 1 / their effective number
     visits: mi.UInt32       # k [n]
@@ -100,12 +101,12 @@ class StepwiseEM:
         return lobes, statistics
 
     @dr.syntax
-    def first_fit(self, particles: Particles, count: mi.UInt32, positive: mi.Float,
-                  rng: mi.PCG32) -> tuple[Lobes, Statistics]:
+    def first_fit(self, particles: Particles, count: mi.UInt32, positive: mi.Float, rng: mi.PCG32,
+                  parallax: bool = False) -> tuple[Lobes, Statistics]:
         """Sweep all `count` particles of each lane, `positive` of them with a weight > 0, until the mean log likelihood
-        changes by less than `tolerance`, relative."""
+        changes by less than `tolerance`, relative.  With `parallax` distances are learnt as well."""
         mean_weight = self._mean_weight(particles, count, positive)
-        lobes, statistics = self.start(particles, count, mean_weight, rng)
+        lobes, statistics = self.start(particles, count, mean_weight, rng, parallax)
         sweep, before, settled = mi.UInt32(0), mi.Float(dr.inf), mi.Bool(False)
         while dr.hint((sweep < self.max_sweeps) & ~settled, mode="symbolic", label="first fit"):
             i, likelihood, weights = mi.UInt32(0), mi.Float(0), mi.Float(0)
@@ -128,7 +129,7 @@ class StepwiseEM:
         while dr.hint(rounds < CLAMP_ROUNDS, mode="symbolic", label="mean weight"):
             i, total = mi.UInt32(0), mi.Float(0)
             while dr.hint(i < count, mode="symbolic"):
-                _, _, weight = particles(i)
+                weight = particles(i)[2]
                 total += dr.minimum(weight, self.weight_clamp * mean) / positive
                 i += 1
             mean = total
@@ -136,8 +137,8 @@ class StepwiseEM:
         return mean
 
     @dr.syntax
-    def start(self, particles: Particles, count: mi.UInt32, mean_weight: mi.Float,
-              rng: mi.PCG32) -> tuple[Lobes, Statistics]:
+    def start(self, particles: Particles, count: mi.UInt32, mean_weight: mi.Float, rng: mi.PCG32,
+              parallax: bool = False) -> tuple[Lobes, Statistics]:
         """k-means++ centres (Arthur & Vassilvitskii 2007) for all components but one, which is wide."""
         centres: list[tuple[mi.Float, mi.Float]] = []
         for _ in range(self.components - 1):
@@ -145,7 +146,7 @@ class StepwiseEM:
             x, y = rng.next_float32(), rng.next_float32()
             i, total = mi.UInt32(0), mi.Float(0)
             while dr.hint(i < count, mode="symbolic", label="k-means++"):
-                px, py, weight = particles(i)
+                px, py, weight = particles(i)[:3]
                 w = dr.minimum(weight / mean_weight, self.weight_clamp)
                 nearest = mi.Float(1e30) if centres else mi.Float(1)
                 for cx, cy in centres:
@@ -166,7 +167,8 @@ class StepwiseEM:
         r = dr.sqrt(EXPONENT / variance)
         zero = dr.zeros(mi.ArrayXf, shape)
         return (Lobes(mass, mean_x, mean_y, r, zero, mi.ArrayXf(r)),
-                Statistics(mi.ArrayXf(mass), mass * variance, mi.ArrayXf(zero), mass * variance, mi.Float(mean_weight),
+                Statistics(mi.ArrayXf(mass), mass * variance, mi.ArrayXf(zero), mass * variance,
+                           mi.ArrayXf(zero) if parallax else None, mi.Float(mean_weight),
                            dr.full(mi.Float, 1 / INITIAL_VISITS, lanes), dr.full(mi.UInt32, INITIAL_VISITS, lanes)))
 
     @dr.syntax
@@ -183,16 +185,16 @@ class StepwiseEM:
         log_norm = dr.log2(lobes.weight * lobes.r_xx * lobes.r_yy)
 
         # Closures, so that the loop below does not carry what it leaves unchanged
-        def particle(q: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
-            x, y, weight = particles(first + dr.minimum(q, count - 1))
-            return x, y, dr.select(q < count, dr.minimum(weight * scale, self.weight_clamp), 0)
+        def particle(q: mi.UInt32) -> Particle:
+            x, y, weight, inverse = particles(first + dr.minimum(q, count - 1))
+            return x, y, dr.select(q < count, dr.minimum(weight * scale, self.weight_clamp), 0), inverse
 
         def log_density(x: mi.Float, y: mi.Float) -> tuple[mi.ArrayXf, mi.ArrayXf, mi.ArrayXf]:
             d_x, d_y = x - lobes.mean_x, y - lobes.mean_y
             q_x, q_y = dr.fma(lobes.r_xx, d_x, lobes.r_xy * d_y), lobes.r_yy * d_y
             return dr.fma(-q_x, q_x, dr.fma(-q_y, q_y, log_norm)), d_x, d_y
 
-        mass, d_xx, d_xy, d_yy = statistics.mass, statistics.d_xx, statistics.d_xy, statistics.d_yy
+        mass, d_xx, d_xy, d_yy, near = statistics.mass, statistics.d_xx, statistics.d_xy, statistics.d_yy, statistics.near
         m_x, m_y = dr.zeros(mi.ArrayXf, dr.shape(mass)), dr.zeros(mi.ArrayXf, dr.shape(mass))
         total, squares, likelihood, weights = mi.Float(1), mi.Float(statistics.squares), mi.Float(0), mi.Float(0)
         k, keep = mi.Float(statistics.visits + 1), mi.Float(1)
@@ -200,7 +202,7 @@ class StepwiseEM:
         q, left = mi.UInt32(0), mi.UInt32(count)
         while dr.hint(left > 0, mode="symbolic"):
             for j in range(UNROLLED):
-                x, y, w = particle(q + j)
+                x, y, w, inverse = particle(q + j)
                 # E-step in the log domain
                 log_p, r_x, r_y = log_density(x, y)
                 peak = dr.max(log_p, axis=0)
@@ -221,6 +223,7 @@ class StepwiseEM:
                 d_xx = dr.fma(c_x, r_x, d_xx)
                 d_xy = dr.fma(c_x, r_y, d_xy)
                 d_yy = dr.fma(c_y, r_y, d_yy)
+                near = None if near is None else dr.fma(c, inverse, near)
                 # eta = k^-alpha for the next k: (k / (k + 1))^alpha, up to terms in k^-3, and k > 100
                 eta *= dr.select(w > 0, 1 - self.alpha * dr.rcp(k + 0.5 * (1 + self.alpha)), 1)
                 k += dr.select(w > 0, mi.Float(1), 0)
@@ -231,7 +234,7 @@ class StepwiseEM:
         norm = dr.rcp(total)
         statistics = Statistics(
             mass * norm, norm * dr.maximum(dr.fma(-m_x, shift_x, d_xx), 0), norm * dr.fma(-m_x, shift_y, d_xy),
-            norm * dr.maximum(dr.fma(-m_y, shift_y, d_yy), 0),
+            norm * dr.maximum(dr.fma(-m_y, shift_y, d_yy), 0), None if near is None else norm * near,
             statistics.mean_weight * keep * total, dr.square(norm) * squares,
             statistics.visits + mi.UInt32(k - mi.Float(statistics.visits + 1) + .5))
         n = dr.rcp(statistics.squares)

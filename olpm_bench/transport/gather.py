@@ -25,7 +25,7 @@ MIN_COSINE = 0.707          # dot(n', n): and those on surfaces that turn away f
 DIGIT_BITS, DIGITS = 8, 3   # of the squared distances, for selection by radix
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Gathered(ParticleBatch):
     """What one gather brings to the records.
 
@@ -35,7 +35,7 @@ class Gathered(ParticleBatch):
     extent: mi.Float
 
 
-def binned(cache: RecordCache, particles: Particles, neighbours: int) -> Gathered:
+def binned(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
     """The particles that fall to each record, at most `neighbours` a record."""
     p, weight, d, _, n = particles.read(particles.place)
     record, normal, valid = cache.lookup(p, n, weight > 0)
@@ -53,10 +53,10 @@ def binned(cache: RecordCache, particles: Particles, neighbours: int) -> Gathere
     i, wanted = dr.arange(mi.UInt32, len(cache)), dr.opaque(mi.Float, neighbours)
     found = dr.maximum(dr.gather(mi.UInt32, offset, i + 1) - dr.gather(mi.UInt32, offset, i), 1)
     extent = cache.row(i)[3] * dr.sqrt(wanted / mi.Float(found))
-    return _batch(cache, particles, place, dr.gather(mi.UInt32, record, chosen), stands_for, extent)
+    return _batch(cache, particles, place, dr.gather(mi.UInt32, record, chosen), stands_for, extent, parallax)
 
 
-def nearest(cache: RecordCache, particles: Particles, neighbours: int) -> Gathered:
+def nearest(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
     """Exactly the `neighbours` nearest particles of each record within r_max."""
     candidates = _Candidates(cache, particles)
     # The squared distance of the last neighbour, digit by digit from the highest: counters tell which digit holds it.
@@ -73,7 +73,7 @@ def nearest(cache: RecordCache, particles: Particles, neighbours: int) -> Gather
     by_path = dr.argsort(hit)               # not by voxel: see Particles
     order, record, _ = group(dr.gather(mi.UInt32, record, by_path), len(cache))
     place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, hit, dr.gather(mi.UInt32, by_path, order)))
-    return _batch(cache, particles, place, record, mi.Float(1), extent)
+    return _batch(cache, particles, place, record, mi.Float(1), extent, parallax)
 
 
 def by_record(cache: RecordCache, particles: Particles) -> tuple[mi.UInt32, mi.UInt32]:
@@ -92,16 +92,18 @@ def _nothing(cache: RecordCache) -> Gathered:
 
 
 def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: mi.UInt32, stands_for: mi.Float,
-           extent: mi.Float) -> Gathered:
-    """A batch of chosen particles, already grouped by record, with directions in the records' frames.
+           extent: mi.Float, parallax: bool) -> Gathered:
+    """A batch of chosen particles, already grouped by record, with directions (and for `parallax` positions) in their frames.
 
     Raises:
         InputError: a weight is infinite.
     """
-    _, weight, d, distance, _ = particles.read(place)
-    frame = mi.Frame3f(cache.row(record)[1])
+    p, weight, d, distance, _ = particles.read(place)
+    position, normal, _, _ = cache.row(record)
+    frame = mi.Frame3f(normal)
     batch = Gathered(frame.to_local(d), weight * stands_for, distance, record, offsets(record, len(cache)),
-                     dr.minimum(extent, dr.opaque(mi.Float, cache.radius)))
+                     frame.to_local(p - position) if parallax else None,
+                     extent=dr.minimum(extent, dr.opaque(mi.Float, cache.radius)))
     finite = dr.all(dr.isfinite(batch.weight))
     dr.eval(batch, finite)
     if not finite:

@@ -23,7 +23,7 @@ from representations.interface import ParticleBatch
 if TYPE_CHECKING:
     from olpm_bench.transport.gather import Gathered
 
-FORMAT = 3              # of guide files
+FORMAT = 4              # of guide files
 MIN_PARTICLES = 80      # records that have seen fewer leave the surface to its BSDF; the mixture's first fit needs as many
 
 
@@ -35,21 +35,25 @@ class GuidedPoint:
         valid: there is a record, and it has seen enough particles.
         fraction: its learnt BSDF fraction; 0: not learnt.
         outgoing: the mean radiance that it returns; -1: not known.
+        at: the point in the record's frame, or None without parallax.
     """
 
-    def __init__(self, guide: Guide, record: mi.UInt32, frame: mi.Frame3f, found: mi.Bool) -> None:
-        self.guide, self.record, self.frame, self.found = guide, record, frame, found
+    def __init__(self, guide: Guide, record: mi.UInt32, frame: mi.Frame3f, found: mi.Bool,
+                 at: mi.Vector3f | None = None) -> None:
+        self.guide, self.record, self.frame, self.found, self.at = guide, record, frame, found, at
         row = dr.gather(mi.Vector4f, guide.rows, record, found)
         self.valid, self.fraction, self.outgoing = row.x > 0, row.y, dr.select(found, row.z, -1)
 
     def sample(self, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Bool]:
         """A direction distributed by `pdf`, and whether there is one: samples may fail."""
-        wo, _ = self.guide.representation.sample(self.guide.state, self.record, sample1, sample2, active & self.valid)
+        # With parallax the same mask as in `pdf`, so that one re-aiming serves both
+        used = self.valid if self.at is not None else active & self.valid
+        wo, _ = self.guide.representation.sample(self.guide.state, self.record, sample1, sample2, used, self.at)
         return self.frame.to_world(wo), active & (wo.z > 0)         # failed ones lie below the record's horizon
 
     def pdf(self, d: mi.Vector3f) -> mi.Float:
         """Density of a direction [1/sr]."""
-        return self.guide.representation.pdf(self.guide.state, self.record, self.frame.to_local(d), self.valid)
+        return self.guide.representation.pdf(self.guide.state, self.record, self.frame.to_local(d), self.valid, self.at)
 
 
 class Guide:
@@ -59,12 +63,14 @@ class Guide:
         cache: where the records are.
         specification: the representation, as in a TOML: ``{"type": "gaussian_mixture", "components": 8}``.
         fraction: initial BSDF fraction of records that learn it; None: they do not.
+        parallax: tell the representation where around a record it is asked, and where its particles landed.
     """
 
-    def __init__(self, cache: RecordCache, specification: dict[str, Any], fraction: float | None = None) -> None:
-        self.cache, self.specification, self.fraction = cache, specification, fraction
+    def __init__(self, cache: RecordCache, specification: dict[str, Any], fraction: float | None = None,
+                 parallax: bool = False) -> None:
+        self.cache, self.specification, self.fraction, self.parallax = cache, specification, fraction, parallax
         self.representation = representations.create(**specification)
-        self.state = self.representation.init(0)
+        self.state = self.representation.init(0, 0, parallax)
         self.count = dr.zeros(mi.UInt32, 0)     # particles seen by each record, or by the one that it began as a copy of
         self.estimates = Estimates.nothing(0)
         self.rows = mi.Float()                  # [n_records * 4] for queries: has seen enough, fraction, outgoing; unused
@@ -89,7 +95,9 @@ class Guide:
     def at(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> GuidedPoint:
         """The distribution at a point with its normal, which looks to the side that light comes from."""
         record, normal, found = self.cache.lookup(p, n, active)
-        return GuidedPoint(self, record, mi.Frame3f(normal), found)
+        frame = mi.Frame3f(normal)
+        at = frame.to_local(p - self.cache.row(record, found)[0]) if self.parallax else None
+        return GuidedPoint(self, record, frame, found, at)
 
     # ---------------------- Learning ----------------------
 
@@ -97,7 +105,7 @@ class Guide:
         """Add records where the points have none: what the record beside them has learnt, if it has the same frame."""
         before, added = self.records, self.cache.grow(p, n, active)
         if added:
-            self.state = states.append(self.state, self.representation.init(added, seed))
+            self.state = states.append(self.state, self.representation.init(added, seed, self.parallax))
             self.count = states.join(self.count, dr.zeros(mi.UInt32, added))
             self.estimates = states.append(self.estimates, Estimates.nothing(added))
             self._inherit(before)
@@ -167,7 +175,8 @@ class Guide:
 
     def save(self, path: str | Path) -> None:
         """Write the guide to a compressed ``.npz`` file."""
-        meta = {"format": FORMAT, "representation": self.specification, "fraction": self.fraction, "particles": self.particles}
+        meta = {"format": FORMAT, "representation": self.specification, "fraction": self.fraction, "parallax": self.parallax,
+                "particles": self.particles}
         arrays = {f"cache.{k}": v for k, v in self.cache.to_numpy().items()}
         arrays |= {f"state.{k}": v for k, v in states.to_numpy(self.state).items()}
         arrays |= {f"estimates.{k}": v for k, v in states.to_numpy(self.estimates).items()}
@@ -194,7 +203,7 @@ class Guide:
             meta = json.loads(str(arrays["meta"]))
             if meta["format"] != FORMAT:
                 raise InputError(f"{path}: guide format {meta['format']}, this version reads {FORMAT}; train again")
-            guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"], meta["fraction"])
+            guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"], meta["fraction"], meta["parallax"])
             guide.state = states.from_numpy(guide.state, part("state."))
             guide.estimates = states.from_numpy(guide.estimates, part("estimates."))
             guide.pixels = PixelEstimate(arrays["pixels"]) if "pixels" in arrays else None

@@ -88,6 +88,7 @@ class TrainingSettings:
     emission_fraction: probability of the emitter's own sampler in guided emission, its defensive share [T 113-117].
     window: what the particles' roulette and splitting keep alike: "contribution", that which they are expected to make to
         the image, or to the light that it receives (Vorba and Křivánek 2016); "flux", their weights, in a wide window [L].
+    parallax: representations re-aim at what they have learnt from the point where they are asked, not from their record's.
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
     schedule: Literal["interleaved", "single_batch"] = "interleaved"
@@ -108,6 +109,7 @@ class TrainingSettings:
     emission: Literal["guided", "emitter"] = "guided"
     emission_fraction: float = 0.2
     window: Literal["flux", "contribution"] = "contribution"
+    parallax: bool = False
 
     def __post_init__(self) -> None:
         _require_types(self, "share")

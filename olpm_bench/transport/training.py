@@ -136,8 +136,8 @@ class Training:
         specification = {"type": representation} if isinstance(representation, str) else dict(representation)
         bounds = surface_bounds(scene)
         self.radiance = Guide(RecordCache(bounds, settings.record_radius), specification,
-                              integrator.fraction if settings.learn_fraction else None)
-        self.importance = Guide(RecordCache(bounds, settings.record_radius), specification)
+                              integrator.fraction if settings.learn_fraction else None, settings.parallax)
+        self.importance = Guide(RecordCache(bounds, settings.record_radius), specification, parallax=settings.parallax)
         self.integrator = GuidedPathIntegrator(integrator, self.radiance)
         self.luminance: np.ndarray | None = None        # of the mean of all camera passes so far (h, w), ...
         self.spp = 0                                    # ... and their samples a pixel
@@ -224,7 +224,7 @@ class Training:
                 guide.shrink()
             guide.grow(p, n, weight > 0, self._next_seed())
         with _Seconds(statistics, "gather"):
-            batch = GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours)
+            batch = GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours, self.settings.parallax)
         with _Seconds(statistics, "update"):
             guide.learn_particles(batch, self._next_seed(), emitted)
             if self.settings.shrink:
@@ -245,7 +245,7 @@ class Training:
                 p, _, _, _, n = vertices.read(vertices.place)
                 guide.grow(p, n, mi.Bool(True), self._next_seed())
             with _Seconds(statistics, "gather"):
-                batch = binned(guide.cache, vertices, self.settings.neighbours)
+                batch = binned(guide.cache, vertices, self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
             before = guide.count.numpy()
             with _Seconds(statistics, "update"):

@@ -67,16 +67,17 @@ class CapState:
 class Cap:
     """Half of the uniform density over z > 0.5 (a cap of pi steradians), and nothing elsewhere: integral 1/2."""
 
-    def init(self, n_records: int, seed: int = 0) -> CapState:
+    def init(self, n_records: int, seed: int = 0, parallax: bool = False) -> CapState:
         return CapState(dr.zeros(mi.Float, n_records))
 
     def update(self, state: CapState, batch: Any, seed: int = 0) -> CapState:
         return state
 
-    def sample(self, state: CapState, record: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
+    def sample(self, state: CapState, record: Any, sample1: Any, sample2: Any, active: Any = True,
+               at: Any = None) -> Any:
         raise NotImplementedError("fit() never samples")
 
-    def pdf(self, state: CapState, record: Any, wo: Any, active: Any = True) -> Any:
+    def pdf(self, state: CapState, record: Any, wo: Any, active: Any = True, at: Any = None) -> Any:
         return dr.select(wo.z > .5, mi.Float(.5 / np.pi), 0)
 
 

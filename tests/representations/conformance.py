@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 from representations.interface import ParticleBatch
+from representations.parallax import aim, inverse
 from representations.square import from_hemisphere
 from representations.state import append, bytes_of, from_numpy, to_numpy
 
@@ -51,30 +52,52 @@ def vector(wo: np.ndarray) -> mi.Vector3f:
 Particles = list[tuple[np.ndarray, np.ndarray]]         # for each record: wo [n, 3], weight [n]
 
 
-def batch(particles: Particles) -> ParticleBatch:
-    """The particles of all records as Dr.Jit arrays."""
+def landing(wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where on a disk of radius 0.1 around the record each particle has landed [n, 3], and its distance [n], some infinite."""
+    rng = np.random.default_rng([11, len(wo)])
+    phi, r = 2 * np.pi * rng.random(len(wo)), 0.1 * np.sqrt(rng.random(len(wo)))
+    distance = np.where(rng.random(len(wo)) < 0.8, 10 ** rng.uniform(-1.5, 1.5, len(wo)), np.inf)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), 0.01 * rng.normal(size=len(wo))], -1), distance
+
+
+def batch(particles: Particles, parallax: bool = False) -> ParticleBatch:
+    """The particles of all records as Dr.Jit arrays; for `parallax` with places and distances."""
     if not any(len(weight) for _, weight in particles):
         return ParticleBatch(wo=dr.zeros(mi.Vector3f, 0), weight=mi.Float(), distance=mi.Float(), record=mi.UInt32(),
                              offset=dr.zeros(mi.UInt32, len(particles) + 1))
     wo, weight = (np.concatenate([p[i] for p in particles]).astype(np.float32) for i in (0, 1))
     record = np.repeat(np.arange(len(particles), dtype=np.uint32), [len(p[1]) for p in particles])
-    return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles))
+    if not parallax:
+        return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles))
+    at, distance = (np.concatenate([landing(p[0])[i] for p in particles]).astype(np.float32) for i in (0, 1))
+    return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles), mi.Float(distance),
+                                     vector(at))
 
 
 @dataclass
 class Case:
-    """Batches of particles to train on, and the directions around which the density may be narrow."""
+    """Batches of particles to train on, and the directions around which the density may be narrow.
+
+    at: the point from which the records are asked, in their frames; then the particles have places and distances too.
+    """
     name: str
     batches: list[Particles]
+    at: tuple[float, float, float] | None = None
 
     def directions(self, record: int) -> np.ndarray:
-        return np.concatenate([np.zeros((0, 3), np.float32), *(p[record][0] for p in self.batches)])
+        particles = [p[record][0] for p in self.batches]
+        if self.at is not None:         # re-aimed to the record, and from there to `at`
+            for i, wo in enumerate(particles):
+                place, distance = landing(wo)
+                x, y, z, near = aim(tuple(vector(wo)), inverse(mi.Float(distance)), -vector(place))
+                particles[i] = normalised(np.stack(aim((x, y, z), near, mi.Vector3f(self.at))[:3], -1))
+        return np.concatenate([np.zeros((0, 3), np.float32), *particles])
 
     def train(self, representation: Any, scale: float = 1) -> Any:
-        state = representation.init(RECORDS, seed=1)
+        state = representation.init(RECORDS, 1, self.at is not None)
         for seed, particles in enumerate(self.batches):
             scaled = [(wo, weight * np.float32(scale)) for wo, weight in particles]
-            state = representation.update(state, batch(scaled), seed)
+            state = representation.update(state, batch(scaled, self.at is not None), seed)
         dr.eval(state)
         return state
 
@@ -111,6 +134,18 @@ def cases() -> list[Case]:
     ]
 
 
+def cases_with_parallax() -> list[Case]:
+    """Asked from beside the record, and from so far that light gets out of sight."""
+    rng = np.random.default_rng(12)
+
+    def each(n: int) -> Particles:
+        return [(lobes(n, rng), rng.lognormal(size=n).astype(np.float32)) for _ in range(RECORDS)]
+
+    beside, afar = (0.05, -0.08, 0.01), (-1.0, 2.0, 0.5)
+    return [Case("untrained from beside", [], beside), Case("one particle from beside", [each(1)], beside),
+            Case("from beside", [each(120), each(60)], beside), Case("from afar", [each(150)], afar)]
+
+
 # ---------------------------------------------------------------------------------------------- the density
 
 def queries(case: Case, n: int = 4096) -> np.ndarray:
@@ -124,20 +159,27 @@ def queries(case: Case, n: int = 4096) -> np.ndarray:
     return normalised(np.concatenate([special, uniform_directions(n, rng), near, sphere]))
 
 
-def density(representation: Any, state: Any, record: int, wo: np.ndarray) -> np.ndarray:
-    """pdf() of one record at directions [n, 3]."""
+def density(representation: Any, state: Any, record: int, wo: np.ndarray,
+            at: tuple[float, float, float] | None = None) -> np.ndarray:
+    """pdf() of one record at directions [n, 3], asked from a point."""
     if len(wo) == 0:
         return np.zeros(0)
-    pdf = representation.pdf(state, dr.full(mi.UInt32, record, len(wo)), vector(wo))
+    pdf = representation.pdf(state, dr.full(mi.UInt32, record, len(wo)), vector(wo), True, place(at))
     return np.array(pdf, np.float64) * np.ones(len(wo))
 
 
-def draw(representation: Any, state: Any, record: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+def place(at: tuple[float, float, float] | None) -> mi.Vector3f | None:
+    return None if at is None else mi.Vector3f(*at)
+
+
+def draw(representation: Any, state: Any, record: int, n: int,
+         at: tuple[float, float, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """n samples of one record: wo [n, 3], pdf [n]."""
     rng = np.random.default_rng([3, record])
     u = (rng.integers(0, 1 << 24, (3, n)) / (1 << 24)).astype(np.float32)           # 0 and 1 - 2^-24 included
     u[:, :8] = np.array([[0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 1, 1, 0, 0, 1, 1], [0, 1, 0, 1, 0, 1, 0, 1]]) * (1 - 2**-24)
-    wo, pdf = representation.sample(state, dr.full(mi.UInt32, record, n), mi.Float(u[0]), mi.Point2f(u[1], u[2]))
+    wo, pdf = representation.sample(state, dr.full(mi.UInt32, record, n), mi.Float(u[0]), mi.Point2f(u[1], u[2]),
+                                    True, place(at))
     return np.array(wo).T, np.array(pdf, np.float64) * np.ones(n)
 
 
@@ -145,7 +187,7 @@ def density_is_valid(representation: Any, case: Case) -> None:
     """Finite, >= 0, and 0 below the horizon."""
     state, wo = case.train(representation), queries(case)
     for record in range(RECORDS):
-        pdf = density(representation, state, record, wo)
+        pdf = density(representation, state, record, wo, case.at)
         assert np.isfinite(pdf).all(), f"record {record}: pdf {pdf[~np.isfinite(pdf)][0]} at {wo[~np.isfinite(pdf)][0]}"
         assert (pdf >= 0).all(), f"record {record}: pdf {pdf.min()} at {wo[pdf.argmin()]}"
         assert (pdf[wo[:, 2] <= 0] == 0).all(), f"record {record}: light from below the horizon"
@@ -155,8 +197,8 @@ def sample_reports_pdf(representation: Any, case: Case, n: int = 1 << 16) -> Non
     """The density that sample() returns is the one that pdf() gives for the direction; directions have unit length."""
     state = case.train(representation)
     for record in range(RECORDS):
-        wo, pdf = draw(representation, state, record, n)
-        again = density(representation, state, record, wo)
+        wo, pdf = draw(representation, state, record, n, case.at)
+        again = density(representation, state, record, wo, case.at)
         assert np.isfinite(wo).all() and np.isfinite(pdf).all() and (pdf >= 0).all(), f"record {record}: not finite"
         alive = pdf > 0
         assert (wo[alive, 2] > 0).all(), f"record {record}: sample below the horizon with pdf > 0"
@@ -215,10 +257,10 @@ def samples_follow_pdf(representation: Any, case: Case) -> None:
     for record in range(RECORDS):
         proposal = Proposal(case.directions(record))
         n = 1 << (17 if len(proposal.around) <= 10 else 15)
-        x, pdf = draw(representation, state, record, n)
+        x, pdf = draw(representation, state, record, n, case.at)
         y = proposal.draw(n, np.random.default_rng([4, record]))
         x, y = x[pdf > 0], y[y[:, 2] > 0]
-        (f_x, q_x), (f_y, q_y) = ((density(representation, state, record, wo), proposal.pdf(wo)) for wo in (x, y))
+        (f_x, q_x), (f_y, q_y) = ((density(representation, state, record, wo, case.at), proposal.pdf(wo)) for wo in (x, y))
         sampled, variance_x = _binned(q_x / (q_x + f_x), x, n)
         expected, variance_y = _binned(f_y / (q_y + f_y), y, n)
         variance = variance_x + variance_y

@@ -9,7 +9,7 @@ import pytest
 import representations
 from representations.jensen import JensenHistogram
 
-CASES = conformance.cases()
+CASES, PARALLAX = conformance.cases(), conformance.cases_with_parallax()
 TESTS = [conformance.density_is_valid, conformance.sample_reports_pdf, conformance.samples_follow_pdf,
          conformance.weight_scale_is_irrelevant, conformance.update_is_pure, conformance.records_are_independent,
          conformance.nothing_new_changes_nothing, conformance.records_can_be_appended, conformance.inactive_lanes_are_harmless]
@@ -24,6 +24,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 @pytest.fixture(scope="module")
 def representation(request: pytest.FixtureRequest) -> Any:
     return representations.create(request.param)
+
+
+@pytest.mark.parametrize("case", PARALLAX, ids=[c.name.replace(" ", "_") for c in PARALLAX])
+@pytest.mark.parametrize("test", TESTS[:3], ids=[t.__name__ for t in TESTS[:3]])
+def test_conformance_with_parallax(representation: Any, test: Any, case: conformance.Case) -> None:
+    test(representation, case)
 
 
 @pytest.mark.parametrize("case", CASES, ids=[c.name.replace(" ", "_") for c in CASES])

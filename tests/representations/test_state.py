@@ -62,3 +62,4 @@ def test_records_are_copied():
     new = copy_records(array, 4, mi.UInt32([0, 0]), mi.UInt32([1, 3]))
     np.testing.assert_array_equal(new.numpy(), [0, 1, 2, 0, 1, 2, 6, 7, 8, 0, 1, 2])
     np.testing.assert_array_equal(array.numpy(), np.arange(12))
+    assert len(copy_records(mi.Float(), 4, mi.UInt32([0, 0]), mi.UInt32([1, 3]))) == 0

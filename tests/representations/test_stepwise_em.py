@@ -24,6 +24,7 @@ class Transcript:
     u: np.ndarray           # [K]
     m: np.ndarray           # [K, 2]
     S: np.ndarray           # [K, 2, 2]
+    near: np.ndarray        # [K]
     squares: float          # sum of the squared shares of the particles
     k: int
 
@@ -51,6 +52,7 @@ class Transcript:
                 self.u = (1 - eta) * self.u + eta * w * gamma
                 self.m = (1 - eta) * self.m + eta * w * gamma[:, None] * s
                 self.S = (1 - eta) * self.S + eta * w * gamma[:, None, None] * np.outer(s, s)
+                self.near = (1 - eta) * self.near + eta * w * gamma * s[0]          # 1 / distance = x: see Rows
                 self.k += 1
                 share = eta * w / self.wbar
                 self.squares = (1 - share) ** 2 * self.squares + share ** 2
@@ -72,13 +74,15 @@ def transcript_of(lobes: Lobes, statistics: Statistics, record: int) -> Transcri
     """The paper's sums, from the moments about the means that we keep."""
     weight, x, y, r_xx, r_xy, r_yy = (np.array(getattr(lobes, f), np.float64)[:, record]
                                       for f in ("weight", "mean_x", "mean_y", "r_xx", "r_xy", "r_yy"))
-    mass, d_xx, d_xy, d_yy = (np.array(getattr(statistics, f), np.float64)[:, record] for f in ("mass", "d_xx", "d_xy", "d_yy"))
+    mass, d_xx, d_xy, d_yy, near = (np.array(getattr(statistics, f), np.float64)[:, record]
+                                    for f in ("mass", "d_xx", "d_xy", "d_yy", "near"))
     R = np.stack([np.stack([r_xx, r_xy], -1), np.stack([0 * r_yy, r_yy], -1)], -2) / np.sqrt(EXPONENT)
     mu, wbar = np.stack([x, y], -1), float(np.array(statistics.mean_weight)[record])
     D = np.stack([np.stack([d_xx, d_xy], -1), np.stack([d_xy, d_yy], -1)], -2)
     second = D + mass[:, None, None] * np.einsum("ki,kj->kij", mu, mu)
     return Transcript(weight, mu, np.linalg.inv(np.einsum("kji,kjl->kil", R, R)), wbar, wbar * mass, wbar * mass[:, None] * mu,
-                      wbar * second, float(np.array(statistics.squares)[record]), int(np.array(statistics.visits)[record]))
+                      wbar * second, wbar * near, float(np.array(statistics.squares)[record]),
+                      int(np.array(statistics.visits)[record]))
 
 
 def points_and_weights(n_records: int, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -92,11 +96,11 @@ def points_and_weights(n_records: int, n: int, seed: int) -> tuple[np.ndarray, n
 
 
 class Rows:
-    """Particles of each record in an ordinary object: i -> (x, y, weight) of each lane."""
+    """Particles of each record in an ordinary object: i -> (x, y, weight, 1 / distance = x) of each lane."""
 
     def __init__(self, points: np.ndarray, weights: np.ndarray) -> None:
         self.lanes, self.n = weights.shape
-        self.data = [mi.Float(np.ascontiguousarray(a).ravel()) for a in (points[..., 0], points[..., 1], weights)]
+        self.data = [mi.Float(np.ascontiguousarray(a).ravel()) for a in (points[..., 0], points[..., 1], weights, points[..., 0])]
 
     def __call__(self, i: mi.UInt32) -> Particle:
         index = dr.arange(mi.UInt32, self.lanes) * self.n + i
@@ -107,6 +111,7 @@ def compare(expected: Transcript, lobes: Lobes, statistics: Statistics, record: 
     found = transcript_of(lobes, statistics, record)
     assert found.k == expected.k
     assert np.allclose(found.wbar, expected.wbar, rtol=1e-4)
+    assert np.allclose(found.near, expected.near, rtol=2e-3, atol=1e-4 * expected.wbar)
     assert np.allclose(found.pi, expected.pi, rtol=2e-3, atol=1e-4)
     scale = np.sqrt(np.einsum("kii->k", expected.sigma))
     assert np.abs((found.mu - expected.mu) / scale[:, None]).max() < 1e-2
@@ -121,7 +126,7 @@ def start() -> tuple[GaussianMixture, Rows, Lobes, Statistics]:
     mixture = GaussianMixture(max_sweeps=3, tolerance=0)
     rows = Rows(*points_and_weights(N_RECORDS, N, 0))
     lobes, statistics = mixture.em.start(rows, dr.full(mi.UInt32, N, N_RECORDS), dr.full(mi.Float, 1.5, N_RECORDS),
-                                         mi.PCG32(N_RECORDS))
+                                         mi.PCG32(N_RECORDS), parallax=True)
     dr.eval(lobes, statistics)
     return mixture, rows, lobes, statistics
 
@@ -142,14 +147,14 @@ def test_first_fit_follows_the_equations(start: tuple[GaussianMixture, Rows, Lob
     points, weights = points_and_weights(N_RECORDS, N, 1)
     rows, positive = Rows(points, weights), np.count_nonzero(weights, axis=1)
     count, limit = dr.full(mi.UInt32, N, N_RECORDS), mi.Float(positive.astype(np.float32))
-    found = mixture.em.first_fit(rows, count, limit, mi.PCG32(N_RECORDS))
+    found = mixture.em.first_fit(rows, count, limit, mi.PCG32(N_RECORDS), parallax=True)
     mean = []
     for w, n in zip(weights.astype(np.float64), positive, strict=True):
         cut = np.inf
         for _ in range(4):
             cut = np.minimum(w, CLAMP * cut).sum() / n
         mean.append(cut)
-    lobes, statistics = mixture.em.start(rows, count, mi.Float(mean), mi.PCG32(N_RECORDS))
+    lobes, statistics = mixture.em.start(rows, count, mi.Float(mean), mi.PCG32(N_RECORDS), parallax=True)
     for record in range(N_RECORDS):
         expected = transcript_of(lobes, statistics, record)
         assert expected.k == INITIAL_VISITS
@@ -194,7 +199,8 @@ def test_no_lobe_dies_of_cancellation() -> None:
         points = np.array([.83, .71]) + np.stack([r * np.cos(phi), r * np.sin(phi)], -1)
         return Rows(points[None].repeat(2, 0).astype(np.float32), np.ones((2, n), np.float32))
 
-    lobes, statistics = mixture.em.first_fit(rows(300), dr.full(mi.UInt32, 300, 2), dr.full(mi.Float, 300, 2), mi.PCG32(2))
+    lobes, statistics = mixture.em.first_fit(rows(300), dr.full(mi.UInt32, 300, 2), dr.full(mi.Float, 300, 2), mi.PCG32(2),
+                                             parallax=True)
     for _ in range(20):
         lobes, statistics = mixture.em.online(rows(1000), dr.full(mi.UInt32, 1000, 2), lobes, statistics)
         dr.eval(lobes, statistics)

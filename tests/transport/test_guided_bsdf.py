@@ -30,12 +30,12 @@ class UniformHemisphere:
     def __init__(self, failure: float) -> None:
         self.failure = failure
 
-    def sample(self, state, record, sample1, sample2, active=True):
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
         failed = sample1 < self.failure
         wo = dr.select(failed, mi.Vector3f(0, 0, -1), mi.warp.square_to_uniform_hemisphere(sample2))
         return wo, self.pdf(state, record, wo)
 
-    def pdf(self, state, record, wo, active=True):
+    def pdf(self, state, record, wo, active=True, at=None):
         return dr.select(wo.z > 0, (1 - self.failure) * dr.inv_two_pi, 0)
 
 

@@ -20,6 +20,7 @@ from representations import state as states
 SMALL = settings.training(passes=3, photons=20_000, importons=10_000, record_radius=0.08, camera_passes=2, camera_paths=2 ** 14)
 PARTICLES = dataclasses.replace(SMALL, camera_passes=0)
 SHRINKING = {"shrink": True, "neighbours": 80}
+PARALLAX = {"parallax": True}
 DEPTH = 6
 PATHS = settings.integrator(max_depth=DEPTH)
 
@@ -48,7 +49,8 @@ def test_guides_learn_on_line(scene, name):
     assert np.mean(guide.count.numpy() >= 40) > 0.8
 
 
-@pytest.mark.parametrize(("name", "changes"), [("jensen", {}), ("gaussian_mixture", {}), ("gaussian_mixture", SHRINKING)])
+@pytest.mark.parametrize(("name", "changes"), [("jensen", {}), ("gaussian_mixture", {}), ("gaussian_mixture", SHRINKING),
+                                               ("gaussian_mixture", PARALLAX), ("hey", PARALLAX)])
 def test_training_repeats_bit_for_bit_whatever_the_threads(scene, name, changes):
     threads = dr.thread_count()
     try:
@@ -68,7 +70,8 @@ def test_seeds_differ(scene):
 
 
 @pytest.mark.parametrize(("name", "changes"), [("jensen", {}), ("hey", {}), ("gaussian_mixture", {}),
-                                               ("gaussian_mixture", SHRINKING)])
+                                               ("gaussian_mixture", SHRINKING), ("gaussian_mixture", PARALLAX),
+                                               ("hey", PARALLAX)])
 def test_no_kernel_is_compiled_after_warm_up(scene, name, changes):
     """Counts, seeds, sizes and pass numbers are data, not code.
 
