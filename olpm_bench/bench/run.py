@@ -39,7 +39,7 @@ from olpm_bench.bench.results import (
 )
 from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
-from olpm_bench.transport.training import PassStatistics, Training, train
+from olpm_bench.transport.training import PassStatistics, Training
 
 PASSES = 40                 # rendering passes in a budget, at least: so it is met within 1/40
 SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
@@ -125,7 +125,10 @@ def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> Warm
                                         importons=min(spec.training.importons, WARM_UP_PATHS),
                                         camera_passes=min(spec.training.camera_passes, 4),
                                         camera_paths=min(spec.training.camera_paths, WARM_UP_PATHS))
-            guide = train(scene, spec.method.representation or {}, small, spec.integrator, seed=WARM_UP_SEED)
+            training = Training(scene, spec.method.representation or {}, small, spec.integrator, WARM_UP_SEED)
+            for _ in training.run():
+                pass
+            guide = training.radiance
         integrator = make_integrator(spec, guide)
         for spp in (1, 2):      # dividing by 1 is a kernel of its own
             render_pass(scene, integrator, WARM_UP_SEED, spp)
@@ -298,6 +301,7 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
         "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
         "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
         "trained": guide.trained if guide is not None else None, "training_passes": len(cell.training),
+        "warnings": list(dict.fromkeys(w for p in cell.training for w in p["warnings"])),
         "records": guide.records if guide is not None else 0, "particles": guide.particles if guide is not None else 0,
         "bytes_per_record": guide.bytes_per_record if guide is not None else 0, "invalid_pixels": 0,
         "mean": float(cell.brightness.mean[0, 0, 0]), "mean_stderr": math.sqrt(float(cell.brightness.variance()[0, 0, 0])),
@@ -429,6 +433,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> list[st
                 if info["trained"] is not None and info["trained"] < TRAINED:
                     flag += (f"; only {info['trained']:.0%} of the records have seen particles enough to guide: "
                              "more photons or passes, or a larger record_radius")
+                flag += "".join(f"; {warning}" for warning in info["warnings"])
                 bar.say(f"[{index + 1}/{len(todo)}] {spec}: {info['spp']} spp in {info['charged_seconds']:.1f} s, "
                         f"{info['train_seconds']:.1f} s of it training{flag}")
     return problems

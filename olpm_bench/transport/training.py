@@ -13,6 +13,7 @@ grow with the number of passes.  The images of camera passes are unbiased, since
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -49,6 +50,7 @@ class PassStatistics:
     regions: dict[str, np.ndarray] = field(default_factory=dict)    # where a caller names them: `Particles.by_region`
     seen: float = 0.0               # particles seen so far by the records that camera paths met, on average
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("trace", "grow", "gather", "update"), 0.0))
+    warnings: list[str] = field(default_factory=list)               # what could not be learnt; images stay right
     image: mi.TensorXf | None = field(default=None, repr=False)
 
     def share(self, part: str) -> float:
@@ -65,11 +67,18 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
           sensor: mi.Sensor | None = None, on_pass: Callable[[PassStatistics], None] | None = None) -> Guide:
     """Train a guide for camera paths; see :class:`Training` for the arguments.
 
+    What could not be learnt is told as Python warnings, once each; the image is right without it.
+
     Args:
         on_pass: called with the statistics of each pass.
     """
+    told: set[str] = set()
     training = Training(scene, representation, settings or TrainingSettings(), integrator or IntegratorSettings(), seed, sensor)
     for statistics in training.run():
+        for message in statistics.warnings:
+            if message not in told:
+                warnings.warn(message, stacklevel=2)
+            told.add(message)
         if on_pass is not None:
             on_pass(statistics)
     return training.radiance
@@ -180,6 +189,9 @@ class Training:
             if self.emission is not None and importons.departures is not None:
                 with _Seconds(statistics, "update"):
                     self.emission.learn(importons.departures, self._next_seed())
+                if not self.emission.learnt:
+                    statistics.warnings.append("too few importons leave towards the lights at infinity: their photons start as "
+                                               "the emitters sample them")
             statistics.importons = s.importons
         return self._photons(s.photons, self.importance, statistics)
 
@@ -210,8 +222,12 @@ class Training:
             if len(particles):
                 left = len(particles) / n
                 self.hits[mode] = (wanted, told * wanted / left) if window else (left, left)
+        kind = "photons" if mode == mi.TransportMode.Importance else "importons"
+        if rays.unit[0] == 0:
+            statistics.warnings.append(f"the {kind} carry nothing: the emitters have no power")
+        elif len(particles) == 0:
+            statistics.warnings.append(f"none of {n} {kind} met a second surface: nothing is learnt from them")
         if self.regions is not None:
-            kind = "photons" if mode == mi.TransportMode.Importance else "importons"
             statistics.regions[kind] = particles.by_region(*self.regions)
         return particles
 
@@ -253,6 +269,8 @@ class Training:
                 guide.learn_camera(batch, self._next_seed())
             statistics.kept, count = len(batch), guide.count.numpy()
             statistics.seen = float(np.mean(count[count > before])) if len(batch) else 0.0
+        else:
+            statistics.warnings.append("the camera sees no surface: there is nothing to guide")
         self._estimate_pixels(image, spp)
         statistics.spp, statistics.stored, statistics.image = spp, len(vertices), image
         statistics.records = guide.records

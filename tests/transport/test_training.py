@@ -183,6 +183,26 @@ def test_scenes_that_cannot_be_traced_are_refused(change, message):
         train(mi.load_dict(content), "jensen", SMALL, PATHS)
 
 
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda s: s["lamp"]["emitter"]["radiance"].update(value=0.0), "the photons carry nothing: the emitters have no power"),
+    (lambda s: s["sensor"].update(to_world=mi.ScalarTransform4f().look_at((0, 0, 5), (0, 0, 9), (0, 1, 0))),
+     "the camera sees no surface"),
+    (lambda s: s.update({k: {**v, "bsdf": grey(0.0)} for k, v in s.items() if k.startswith("wall")}),
+     "none of 20000 photons met a second surface"),
+])
+def test_what_cannot_be_learnt_is_told_and_images_are_right(change, message):
+    content = box(grey(0.6), lamp=lamp())
+    change(content)
+    scene = mi.load_dict(content, optimize=False)
+    with pytest.warns(UserWarning, match=message):
+        guide = train(scene, "gaussian_mixture", SMALL, PATHS)
+    path = mi.load_dict({"type": "path", "max_depth": DEPTH})
+    ours, theirs = (mi.render(scene, integrator=i, spp=256, seed=s).numpy() for s, i in enumerate(
+        (olpm_bench.integrator(guide, max_depth=DEPTH), path)))
+    assert np.isfinite(ours).all() and ours.mean() == pytest.approx(theirs.mean(), rel=0.05, abs=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:none of")
 def test_particles_that_never_land_leave_the_bsdf():
     """Black walls: nothing is kept, nothing is learnt, and the image is direct light."""
     scene = mi.load_dict(box(grey(0.0), lamp=lamp()))
