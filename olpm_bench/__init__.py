@@ -2,7 +2,7 @@
 
 As a library, after `mi.set_variant`:
 
-    guide = olpm_bench.train(scene, "gaussian_mixture", passes=5)
+    guide = olpm_bench.train(scene, "gaussian_mixture", camera_passes=24)
     image = mi.render(scene, integrator=olpm_bench.integrator(guide, max_depth=13), spp=64)
 
 or `olpm_bench.register()`, and then the Mitsuba plugin `guided_path`.

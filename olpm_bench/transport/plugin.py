@@ -1,6 +1,6 @@
 """The Mitsuba plugin `guided_path`, for scene files and `mi.load_dict`.
 
-    integrator = mi.load_dict({"type": "guided_path", "representation": "gaussian_mixture", "passes": 5})
+    integrator = mi.load_dict({"type": "guided_path", "representation": "gaussian_mixture", "camera_passes": 24})
     image = mi.render(scene, integrator=integrator, spp=64)
 
 Its parameters are flat: those of `IntegratorSettings` and `TrainingSettings`, `preset`, `representation` (a name, or

@@ -92,7 +92,7 @@ class TrainingSettings:
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
     schedule: Literal["interleaved", "single_batch"] = "interleaved"
-    passes: int = 3
+    passes: int = 2
     photons: int = 300_000
     importons: int = 100_000
     camera_passes: int = 64
