@@ -22,6 +22,13 @@ def join(a: Any, b: Any) -> Any:
     return result
 
 
+def copied(dtype: Any, array: np.ndarray) -> Any:
+    """A NumPy array in Dr.Jit's own memory: NumPy's is aligned now this way, now that, and each way compiles other kernels."""
+    copy = dr.gather(dtype, dtype(array), dr.arange(dr.uint32_array_t(dtype), len(array)))
+    dr.eval(copy)
+    return copy
+
+
 def append(state: State, more: State) -> State:
     """A state with the records of `state`, then those of `more`."""
     fields = {f.name: join(getattr(state, f.name), getattr(more, f.name)) for f in dataclasses.fields(state)}  # type: ignore[arg-type]

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from olpm_bench.transport.settings import InputError
-from representations.state import join
+from representations.state import copied, join
 
 MIN_COSINE = 0.751              # 2 sqrt(1.001 - n.n') <= 1: the largest angle between the normals of point and record [L]
 NEAR_COSINE = 0.4               # of the normals of records that clamp each other's radii [L]
@@ -349,13 +349,6 @@ class RecordCache:
             cache.table = copied(mi.UInt32, table)
             cache._assign(np.zeros(len(cache.cells), bool))
         return cache
-
-
-def copied(dtype: Any, array: np.ndarray) -> Any:
-    """In Dr.Jit's own memory: NumPy's is aligned now this way, now that, and each way compiles other kernels."""
-    copy = dr.gather(dtype, dtype(array), dr.arange(mi.UInt32, len(array)))
-    dr.eval(copy)
-    return copy
 
 
 def _nearest(points: np.ndarray, queries: np.ndarray, k: int, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

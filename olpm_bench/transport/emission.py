@@ -22,13 +22,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from olpm_bench.transport.cache import MISSING, copied
+from olpm_bench.transport.cache import MISSING
 from olpm_bench.transport.guide import MIN_PARTICLES
 from olpm_bench.transport.particles import Departures, ParticleRays, evaluated
 from representations import discrete, square
 from representations import state as states
 from representations.gaussian_mixture import GaussianMixture
 from representations.interface import ParticleBatch
+from representations.state import copied
 
 BLOCK = 5                           # edge of a block in cells, of an area in blocks, of a zone in areas
 ZONES = 4                           # along the edge of a hemisphere's square

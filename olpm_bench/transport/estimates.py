@@ -19,6 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from representations.interface import ParticleBatch
+from representations.state import copied
 
 MEMORY = 0.7                # of what was learnt about the fraction, kept from one pass to the next: the guide changes
 PRIOR = 20.0                # visits of mean weight that the initial fraction counts for
@@ -97,7 +98,7 @@ class Estimates:
             near = cKDTree(points).query(points[few], k=NEIGHBOURS, workers=dr.thread_count())[1]
             n, total = visits[near].sum(1), (visits[near] * returned[near]).sum(1)
             result[few] = np.where((n >= ENOUGH) & (total > 0), total / np.maximum(n, 1), -1)
-        return mi.Float(result.astype(np.float32))
+        return copied(mi.Float, result.astype(np.float32))
 
 
 def _advance(mean: mi.Float, count: mi.Float, batch: ParticleBatch) -> tuple[mi.Float, mi.Float]:

@@ -13,12 +13,13 @@ import numpy as np
 
 import representations
 from olpm_bench.transport import radius
-from olpm_bench.transport.cache import RecordCache, copied
+from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.estimates import Estimates
 from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.settings import InputError
 from representations import state as states
 from representations.interface import ParticleBatch
+from representations.state import copied
 
 if TYPE_CHECKING:
     from olpm_bench.transport.gather import Gathered

@@ -12,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter, median_filter
 
+from representations.state import copied
+
 LEAST = 0.05            # survival probability
 DARKEST = 0.02          # of a pixel, relative to the image's mean: black ones would keep every path
 SIGMA = 1.0             # of the filter [pixels]
@@ -29,8 +31,7 @@ class PixelEstimate:
         smooth = gaussian_filter(median_filter(self.luminance, 3), SIGMA)
         smooth = np.maximum(smooth, DARKEST * max(float(smooth.mean()), 1e-30))
         self.height, self.width = smooth.shape
-        self.values = mi.Float(np.ascontiguousarray(smooth.ravel()))
-        dr.make_opaque(self.values)
+        self.values = copied(mi.Float, smooth.ravel())
         self.size = dr.opaque(mi.UInt32, self.width), dr.opaque(mi.UInt32, self.height)
 
     def at(self, position: mi.Point2f) -> mi.Float:
