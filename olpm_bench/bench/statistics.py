@@ -74,25 +74,23 @@ def interpolate(times: np.ndarray, errors: np.ndarray, at: np.ndarray) -> np.nda
 def common_curve(times: Sequence[np.ndarray], errors: Sequence[np.ndarray], n: int = 65) -> Curve:
     """Curves of several seeds, each with its own checkpoints, on the geometric axis of times that all of them cover.
 
-    Curves of a single checkpoint each stay as they are, at its median time.
+    Curves of a single checkpoint each, or that share no time, are told by their ends, at the median of those times.
 
     Args:
         times, errors: per seed, equally long; times (or samples per pixel) increasing and positive, errors positive.
         n: points of the axis.
 
     Raises:
-        InputError: an input out of that range, or curves without a common time.
+        InputError: an input out of that range.
     """
     for t, e in zip(times, errors, strict=True):
         if len(t) != len(e) or not (np.diff(t) > 0).all() or not np.min(t) > 0:
             raise InputError(f"times {np.asarray(t).tolist()}: must increase from above 0, one per error")
         if not (np.min(e) > 0 and np.isfinite(e).all()):
             raise InputError(f"errors {np.asarray(e).tolist()}: must be positive and finite")
-    if all(len(t) == 1 for t in times):
-        return Curve(np.median(np.asarray(times, np.float64), axis=0), np.asarray(errors, np.float64))
     start, end = max(t[0] for t in times), min(t[-1] for t in times)
-    if start > end:
-        raise InputError(f"the seeds' curves share no time: one starts at {start:.3g}, another ends at {end:.3g}")
+    if start > end or all(len(t) == 1 for t in times):
+        return Curve(np.array([np.median([t[-1] for t in times])]), np.array([[e[-1]] for e in errors], np.float64))
     at = np.geomspace(start, end, n)
     at[0], at[-1] = start, end      # exactly: rounding must not leave the measured range
     return Curve(at, np.stack([interpolate(t, e, at) for t, e in zip(times, errors, strict=True)]))
