@@ -96,5 +96,5 @@ def test_particles_cross_the_slit(tmp_path):
     for kind in ("photons", "importons"):
         assert np.all(shares["contribution"][kind][-1] > 1.2 * shares["flux"][kind][-1]), (kind, shares)
     with figures.style():
-        figures.save(particles.draw(seen, ("dark room", "corridor")), tmp_path)
-    assert (tmp_path / "figure.png").stat().st_size > 5_000
+        figures.save(particles.draw(seen, ("dark room", "corridor")), tmp_path, "particles")
+    assert (tmp_path / "particles.png").stat().st_size > 5_000
