@@ -35,12 +35,13 @@ def draw(passes: Sequence[PassStatistics], names: Sequence[str]) -> Figure:
         total = np.maximum(hits[:, :, 0].sum(1, keepdims=True), 1)
         for r, (name, style) in enumerate(zip(names, rcParams["axes.prop_cycle"](), strict=False)):
             axes.plot(index, hits[:, r, 0] / total[:, 0], **style, label=name)
-            axes.fill_between(index, hits[:, r, 1] / total[:, 0], color=style["color"], alpha=0.17, linewidth=0)
+            axes.fill_between(index, hits[:, r, 1] / total[:, 0], color=style["color"], alpha=0.17, linewidth=0,
+                              label=f"{name}: effective")
         axes.set_title(kind)
         axes.set_xlabel("training pass")
         axes.set_ylim(0, 1)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.yaxis.set_major_formatter(PercentFormatter(1))
     figure.axes[0].set_ylabel("share of the hits")
-    figure.axes[0].legend()
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2 * len(names))
     return figure
