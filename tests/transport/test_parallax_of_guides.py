@@ -16,6 +16,8 @@ from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import emit_photons, trace
 from olpm_bench.transport.training import surface_bounds, train
 
+pytestmark = pytest.mark.slow
+
 WIDE = settings.training(passes=2, photons=20_000, importons=10_000, camera_passes=2, camera_paths=2 ** 14, record_radius=0.1,
                          parallax=True)
 DEPTH = 5
