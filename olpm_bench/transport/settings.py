@@ -86,7 +86,7 @@ class TrainingSettings:
     emission: "guided" starts photons of lights at infinity (constant, envmap, sunsky, directional) where importons leave for
         them; "emitter" by the emitters' own samplers.
     emission_fraction: probability of the emitter's own sampler in guided emission, its defensive share [T 113-117].
-    window: what the particles' roulette and splitting keep alike: "contribution", that which they are expected to make to
+    weight_window: what the particles' roulette and splitting keep alike: "contribution", that which they are expected to make to
         the image, or to the light that it receives (Vorba and Křivánek 2016); "flux", their weights, in a wide window [L].
     parallax: representations re-aim at what they have learnt from the point where they are asked, not from their record's.
     """
@@ -108,7 +108,7 @@ class TrainingSettings:
     learn_fraction: bool = True
     emission: Literal["guided", "emitter"] = "guided"
     emission_fraction: float = 0.2
-    window: Literal["flux", "contribution"] = "contribution"
+    weight_window: Literal["flux", "contribution"] = "contribution"
     parallax: bool = False
 
     def __post_init__(self) -> None:
@@ -116,7 +116,7 @@ class TrainingSettings:
         _require_choice(self, "schedule", "interleaved", "single_batch")
         _require_choice(self, "gather", "binned", "nearest")
         _require_choice(self, "emission", "guided", "emitter")
-        _require_choice(self, "window", "flux", "contribution")
+        _require_choice(self, "weight_window", "flux", "contribution")
         for name in ("passes", "importons", "camera_passes"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), ">= 0")
         for name in ("photons", "camera_paths", "neighbours"):
@@ -135,7 +135,7 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
 
 # The talk's particles, gather and schedule [T, L]: photons and importons only, a fixed fraction.
 _PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "importons": 300_000, "camera_passes": 0,
-          "learn_fraction": False, "window": "flux"}
+          "learn_fraction": False, "weight_window": "flux"}
 
 # What each preset changes of the defaults, which are those of `best`.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {

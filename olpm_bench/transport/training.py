@@ -214,7 +214,7 @@ class Training:
             self.sampler.seed(dr.opaque(mi.UInt32, self._next_seed()), n)
             rays = emit(self.sampler)
             window, (wanted, told) = None, self.hits.get(mode, (0.0, 0.0))
-            if self.settings.window == "contribution" and told and guide is not None and guide.records and own.records:
+            if self.settings.weight_window == "contribution" and told and guide is not None and guide.records and own.records:
                 window = by_contribution(guide, own, told, rays.unit / dr.opaque(mi.Float, n))
             emission = self.emission if mode == mi.TransportMode.Radiance else None
             particles = trace(self.scene, rays, self.sampler, guide, self.settings.fraction, self.max_depth, mode, window,

@@ -1,6 +1,8 @@
 """Settings: presets, changes, and what is refused with which words."""
 from __future__ import annotations
 
+from dataclasses import fields
+
 import pytest
 
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, training, with_changes
@@ -38,3 +40,9 @@ def test_wrong_values(changes, message):
 
 def test_a_whole_number_is_a_number():
     assert with_changes(IntegratorSettings(), {"fraction": 1}).fraction == 1
+
+
+def test_names_are_told_apart_where_they_are_flat():
+    """The plugin's parameters are one list: only `fraction` sets both, as its docstring says."""
+    names = [{f.name for f in fields(cls)} for cls in (IntegratorSettings, TrainingSettings)]
+    assert names[0] & names[1] == {"fraction"}

@@ -85,7 +85,7 @@ def test_particles_cross_the_slit(tmp_path):
     scene = load("door_ajar", width=96, height=54)
     shares = {}
     for window in ("flux", "contribution"):
-        few = settings.training(passes=4, photons=100_000, importons=50_000, camera_passes=0, window=window)
+        few = settings.training(passes=4, photons=100_000, importons=50_000, camera_passes=0, weight_window=window)
         seen = list(Training(scene, "gaussian_mixture", few, settings.integrator(), regions=(door_ajar.room, 2)).run())
         shares[window] = {kind: np.array([s.regions[kind][r] / s.regions[kind][:, 0].sum() for s in seen])
                           for r, kind in enumerate(("photons", "importons"))}
