@@ -92,7 +92,7 @@ class Estimates:
             points: positions of the records (n, 3).
         """
         visits, returned = self.visits.numpy().astype(float), self.returned.numpy().astype(float)
-        few = np.flatnonzero(visits < ENOUGH)
+        few = np.flatnonzero((visits < ENOUGH) & visits.any())              # nobody asks where no camera path has been
         result = np.where(returned > 0, returned, -1.0)
         if len(few) and len(points) >= NEIGHBOURS:
             near = cKDTree(points).query(points[few], k=NEIGHBOURS, workers=dr.thread_count())[1]

@@ -131,21 +131,25 @@ class Guide:
             self.estimates.learn_fluence(batch, self.areas() * dr.opaque(mi.Float, emitted))
             self._update(self.estimates.normalise_particles(batch), seed)
 
-    def learn_camera(self, batch: ParticleBatch, seed: int) -> None:
-        """One on-line update with estimates of incident radiance from the camera paths of one pass."""
+    def learn_camera(self, batch: ParticleBatch, returned: mi.Float, chosen_by_bsdf: mi.Float, offset: mi.UInt32,
+                     seed: int) -> None:
+        """One on-line update with the camera paths of one pass.
+
+        Args:
+            batch: estimates of incident radiance.
+            returned, chosen_by_bsdf, offset: of all vertices, see :meth:`Estimates.learn`.
+        """
+        self.estimates.learn(returned, chosen_by_bsdf, offset)
         if len(batch):
-            self._update(self.estimates.normalise_camera(batch), seed)
+            batch = self.estimates.normalise_camera(batch)
+        self._update(batch, seed)
 
     def _update(self, batch: ParticleBatch, seed: int) -> None:
-        self.state = self.representation.update(self.state, batch, seed)
-        self.count = self.count + batch.count()
-        self.particles += len(batch)
-        dr.eval(self.state, self.count)
-        self._tabulate()
-
-    def learn_returned(self, returned: mi.Float, chosen_by_bsdf: mi.Float, offset: mi.UInt32) -> None:
-        """Update what the records return and their BSDF fraction; see :meth:`Estimates.learn`."""
-        self.estimates.learn(returned, chosen_by_bsdf, offset)
+        if len(batch):
+            self.state = self.representation.update(self.state, batch, seed)
+            self.count = self.count + batch.count()
+            self.particles += len(batch)
+            dr.eval(self.state, self.count)
         self._tabulate()
 
     def _tabulate(self) -> None:

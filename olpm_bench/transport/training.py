@@ -263,12 +263,11 @@ class Training:
             with _Seconds(statistics, "gather"):
                 batch = binned(guide.cache, vertices, self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
-            before = guide.count.numpy()
             with _Seconds(statistics, "update"):
-                guide.learn_returned(*paths.returned(place), offset)
-                guide.learn_camera(batch, self._next_seed())
-            statistics.kept, count = len(batch), guide.count.numpy()
-            statistics.seen = float(np.mean(count[count > before])) if len(batch) else 0.0
+                guide.learn_camera(batch, *paths.returned(place), offset, self._next_seed())
+            statistics.kept = len(batch)
+            if len(batch):
+                statistics.seen = float(np.mean(guide.count.numpy()[batch.count().numpy() > 0]))
         else:
             statistics.warnings.append("the camera sees no surface: there is nothing to guide")
         self._estimate_pixels(image, spp)

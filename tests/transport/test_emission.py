@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from scipy import stats
-from small_scenes import box, grey, lamp, wall
+from small_scenes import assert_no_kernel_a_pass, box, grey, lamp, wall
 
 from olpm_bench.transport import emission
 from olpm_bench.transport.emission import EmissionGuide
@@ -186,16 +186,7 @@ def test_no_kernel_is_compiled_after_warm_up():
     scene = room(sky=light("envmap"), sun=light("directional"))
     many = settings(passes=8, photons=20_000, importons=20_000, record_radius=0.08)
     train(scene, "jensen", many, PATHS)
-    passes = Training(scene, "jensen", many, PATHS, seed=1).run()
-    for _ in range(3):
-        next(passes)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        for _ in passes:
-            pass
-        history = dr.kernel_history([dr.KernelType.JIT])
-    assert len(history) > 100
-    assert len([k["size"] for k in history if not k["cache_hit"]]) <= 1
+    assert_no_kernel_a_pass(Training(scene, "jensen", many, PATHS, seed=1).run())
 
 
 def test_memory_is_bounded():
