@@ -113,9 +113,9 @@ def vertex_cost(scene: mi.Scene, guides: dict[str, Guide | None], spp: int) -> d
     class VertexCounter(GuidedPathIntegrator):
         """Renders the number of vertices of each path."""
 
-        def sample(self, scene, sampler, ray, medium=None, active=True):
-            _, valid, vertices = self.walk(scene, sampler, ray, active)
-            return mi.Spectrum(mi.Float(vertices)), valid, []
+        def walk(self, *args, **kwargs):
+            _, valid, vertices = super().walk(*args, **kwargs)
+            return mi.Spectrum(mi.Float(vertices)), valid, vertices
 
     settings = options.IntegratorSettings(max_depth=MAX_DEPTH, roulette="none")
     integrators = {name: GuidedPathIntegrator(settings, guide) for name, guide in guides.items()}

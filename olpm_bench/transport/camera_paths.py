@@ -32,20 +32,23 @@ class CameraPaths:
     sample and not pixel by pixel: on-line learning remembers the last best, which should not be the bottom of the image.
 
     Args:
-        pixels, spp: of the image.
+        pixels, spp, paths_a_lane: of the image.
         max_depth: longest path [segments]; -1: no limit, and vertices beyond `UNBOUNDED_DEPTH` are not kept.
     """
 
-    def __init__(self, pixels: int, spp: int, max_depth: int) -> None:
-        lane = dr.arange(mi.UInt32, pixels * spp)
-        pixel = lane // dr.opaque(mi.UInt32, spp)
+    def __init__(self, pixels: int, spp: int, max_depth: int, paths_a_lane: int = 1) -> None:
+        lanes = spp // paths_a_lane                                         # of a pixel
+        lane = dr.arange(mi.UInt32, pixels * lanes)
+        pixel = lane // dr.opaque(mi.UInt32, lanes)
         stride = -(-pixels * spp // MOST_PATHS)
         kept = (pixels + stride - 1) // stride
         self.n_paths = kept * spp
         self.rows = max((max_depth if max_depth >= 0 else UNBOUNDED_DEPTH) - 1, 1)
         opaque = dr.opaque(mi.UInt32, stride)
         self.kept = pixel % opaque == 0
-        self.path = (lane - pixel * dr.opaque(mi.UInt32, spp)) * dr.opaque(mi.UInt32, kept) + pixel // opaque
+        first = (lane - pixel * dr.opaque(mi.UInt32, lanes)) * dr.opaque(mi.UInt32, paths_a_lane)
+        self.a_sample = dr.opaque(mi.UInt32, kept)                          # paths of a sample of all pixels
+        self.first = first * self.a_sample + pixel // opaque                # path of each lane; the next are `a_sample` apart
         self.n = dr.opaque(mi.UInt32, self.n_paths)
         size = 4 * self.rows * self.n_paths
         self.position = dr.empty(mi.Float, size)        # and weight of the radiance estimate, filled in by `propagate`
@@ -60,18 +63,21 @@ class CameraPaths:
         """What the kernel of the path tracer writes."""
         yield from (self.position, self.direction, self.normal, self.weight, self.reflected, self.emitted, self.count)
 
-    def arrive(self, depth: mi.UInt32, ray: mi.Ray3f, t: mi.Float, emitted: mi.Spectrum, active: mi.Bool) -> None:
-        """The continuation of the vertex before the one at `depth` has arrived, after a distance t (infinity: nowhere)."""
+    def arrive(self, path: mi.UInt32, depth: mi.UInt32, ray: mi.Ray3f, t: mi.Float, emitted: mi.Spectrum,
+               active: mi.Bool) -> None:
+        """The continuation of the vertex before the one at `depth` of the lane's path has arrived, after a distance t
+        (infinity: nowhere)."""
         active = active & self.kept & (depth > 0) & (depth <= self.rows)
-        place = (depth - 1) * self.n + self.path
+        place = (depth - 1) * self.n + self.first + path * self.a_sample
         dr.scatter(self.direction, mi.Vector4f(ray.d.x, ray.d.y, ray.d.z, t), place, active)
         dr.scatter(self.emitted, mi.Vector4f(emitted.x, emitted.y, emitted.z, 0), place, active)
 
-    def leave(self, depth: mi.UInt32, si: mi.SurfaceInteraction3f, bsdf: GuidedBSDF, bs: mi.BSDFSample3f, weight: mi.Spectrum,
-              survive: mi.Float, reflected: mi.Spectrum, active: mi.Bool) -> None:
+    def leave(self, path: mi.UInt32, depth: mi.UInt32, si: mi.SurfaceInteraction3f, bsdf: GuidedBSDF, bs: mi.BSDFSample3f,
+              weight: mi.Spectrum, survive: mi.Float, reflected: mi.Spectrum, active: mi.Bool) -> None:
         """A vertex and its continuation, of which `weight` is 0 where roulette has ended the path."""
         active = active & self.kept & (depth < self.rows)
-        place = depth * self.n + self.path
+        path = self.first + path * self.a_sample
+        place = depth * self.n + path
         n = dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))
         learnable = (dr.max(weight) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         cosine = dr.maximum(dr.dot(n, si.to_world(bs.wo)), 0)
@@ -80,7 +86,7 @@ class CameraPaths:
         dr.scatter(self.normal, mi.Vector4f(n.x, n.y, n.z, bsdf.chosen_by_bsdf), place, active)
         dr.scatter(self.weight, mi.Vector4f(weight.x, weight.y, weight.z, per_pdf), place, active)
         dr.scatter(self.reflected, mi.Vector4f(reflected.x, reflected.y, reflected.z, 0), place, active)
-        dr.scatter(self.count, depth + 1, self.path, active)
+        dr.scatter(self.count, depth + 1, path, active)
 
     @dr.syntax
     def propagate(self) -> None:

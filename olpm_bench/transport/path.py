@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from olpm_bench.transport import roulette
 from olpm_bench.transport.camera_paths import CameraPaths
+from olpm_bench.transport.camera_rays import CameraRays, paths_a_lane
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
 from olpm_bench.transport.settings import IntegratorSettings
 
@@ -56,20 +57,24 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         """
         film = sensor.film()
         with dr.suspend_grad():
-            sampler, _ = self.prepare(sensor, dr.opaque(mi.UInt32, seed), spp)
-            ray, weight, position = self.sample_rays(scene, sensor, sampler)
-            uv = (position - film.crop_offset()) / mi.Vector2f(film.crop_size())
-            L, valid, _ = self.walk(scene, sampler, ray, True, mi.Point2f(uv), log)
+            camera = CameraRays(sensor, spp, self.paths_a_lane(sensor, spp))
+            sampler, _ = self.prepare(sensor, dr.opaque(mi.UInt32, seed), camera.lanes_a_pixel)
+            ray, weight, position = camera.next(sampler)
+            L, valid, _ = self.walk(scene, sampler, ray, True, weight, camera, log)
             block = film.create_block()
-            self._splat(block, film, position, L * weight, dr.select(valid, mi.Float(1), 0), ray)
+            self._splat(block, film, position, L, camera.paths_a_lane, dr.select(valid, mi.Float(1), 0), ray)
             film.put_block(block)
             if log is not None:
                 dr.schedule(*log.arrays())
             return film.develop()
 
+    def paths_a_lane(self, sensor: mi.Sensor, spp: int) -> int:
+        """How many samples of its pixel a lane takes: one without a guide, where more save nothing."""
+        return 1 if self.guide is None or self.hide_emitters else paths_a_lane(sensor, spp)
+
     @staticmethod
-    def _splat(block, film, position, value, alpha, ray):
-        mi.ad.integrators.common.ADIntegrator._splat_to_block(block, film, position, value, 1.0, alpha, [], ray.wavelengths)
+    def _splat(block, film, position, value, weight, alpha, ray):
+        mi.ad.integrators.common.ADIntegrator._splat_to_block(block, film, position, value, weight, alpha, [], ray.wavelengths)
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """Radiance along camera rays, for those who ask without a film."""
@@ -77,26 +82,30 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         return L, valid, []
 
     @dr.syntax
-    def walk(self, scene, sampler, ray, active, position=None, log=None):
-        """Trace paths; returns their radiance, whether they hit anything, and their number of vertices.
+    def walk(self, scene, sampler, ray, active, weight=1, camera=None, log=None):
+        """Trace the path of each ray, and the further ones of a lane; returns the sum of their radiance, whether the last hit
+        anything, and their number of vertices.
 
         Args:
-            position: of the rays on the film in [0, 1]^2, for the roulette's pixel estimate; None: there is none.
+            weight: of the rays.
+            camera: where they come from and further ones are to be had; its pixels are what the roulette looks at.
             log: keeps the vertices.
         """
         guide, fraction, rr_depth, window = self.guide, self.settings.fraction, self.settings.rr_depth, self.settings.window
         max_depth = self.settings.max_depth if self.settings.max_depth >= 0 else 0xFFFFFFFF
         estimate = guide.pixels if guide is not None and self.settings.roulette == "contribution" else None
-        pixel = estimate.at(position) if estimate is not None and position is not None else None
+        pixel = estimate.at(camera.uv) if estimate is not None and camera is not None else None
+        paths = camera.paths_a_lane if camera is not None else 1
         end_paths, by_contribution = self.settings.roulette != "none", pixel is not None
         worth = window * pixel if pixel is not None else mi.Float(0)        # what a path is worth to its pixel
         ctx = mi.BSDFContext()
 
         ray = mi.Ray3f(ray)
         L = mi.Spectrum(0)                              # radiance carried to the camera
-        beta = mi.Spectrum(1)                           # throughput of the path so far
+        beta = mi.Spectrum(weight)                      # throughput of the path so far
         eta = mi.Float(1)                               # relative index of refraction along the path
         depth = mi.UInt32(0)                            # segments traced
+        path, vertices = mi.UInt32(0), mi.UInt32(0)     # number of the lane's path, and vertices of those before it
         active = mi.Bool(active)
         si_prev = dr.zeros(mi.Interaction3f)            # the vertex the ray leaves, ...
         pdf_prev = mi.Float(1)                          # ... the density it was continued with,
@@ -113,7 +122,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             emitted = mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, visible) & visible
             L += beta * emitted
             if dr.hint(log is not None, mode="scalar"):
-                log.arrive(depth, ray, si.t, emitted, active)
+                log.arrive(path, depth, ray, si.t, emitted, active)
 
             # Emitters on the surface are hit even at the last depth; everything below needs one more segment.
             active_next = active & si.is_valid() & (depth + 1 < max_depth)
@@ -143,7 +152,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             active_next &= survives
             weight = dr.select(active_next, weight / survive, 0)
             if dr.hint(log is not None, mode="scalar"):
-                log.leave(depth, si, bsdf, bs, weight, survive, reflected, active & si.is_valid())
+                log.leave(path, depth, si, bsdf, bs, weight, survive, reflected, active & si.is_valid())
 
             # ---------------------- Update loop variables ----------------------
             ray = si.spawn_ray(si.to_world(bs.wo))
@@ -156,7 +165,17 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             depth[active & si.is_valid()] += 1
             active = active_next
 
-        return L & valid_ray, valid_ray, depth
+            # ---------------------- The lane's next path ----------------------
+            if dr.hint(paths > 1, mode="scalar"):
+                begins = ~active & (path + 1 < paths)
+                fresh, weight, _ = camera.next(sampler, begins)
+                ray, beta, eta = dr.select(begins, fresh, ray), dr.select(begins, weight, beta), dr.select(begins, 1, eta)
+                pdf_prev, delta_prev = dr.select(begins, 1, pdf_prev), delta_prev | begins
+                vertices += dr.select(begins, depth, 0)
+                depth, path = dr.select(begins, 0, depth), dr.select(begins, path + 1, path)
+                active |= begins
+
+        return L & valid_ray, valid_ray, vertices + depth
 
     def to_string(self) -> str:
         return f"GuidedPathIntegrator[{self.settings}, guide={self.guide}]"

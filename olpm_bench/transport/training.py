@@ -250,7 +250,7 @@ class Training:
     def _camera_pass(self, statistics: PassStatistics) -> PassStatistics:
         """Render an image with the guide as it is, and learn from its paths."""
         spp = self.camera_spp
-        paths = CameraPaths(self.pixels, spp, self.max_depth)
+        paths = CameraPaths(self.pixels, spp, self.max_depth, self.integrator.paths_a_lane(self.sensor, spp))
         with _Seconds(statistics, "trace"):
             image = self.integrator.render_paths(self.scene, self.sensor, self._next_seed(), spp, paths)
             dr.eval(image)

@@ -15,11 +15,13 @@ ALBEDO, DEPTH, SPP = 0.6, 6, 16
 POINT = {"type": "point", "position": [0.3, 0.4, 0.3], "intensity": 1.0}        # which no path can hit
 
 
-def _render(content, **settings) -> tuple[mi.TensorXf, CameraPaths]:
+def _render(content, paths_a_lane=1, **settings) -> tuple[mi.TensorXf, CameraPaths]:
     scene = mi.load_dict(content, optimize=False)
     sensor = scene.sensors()[0]
-    paths = CameraPaths(int(np.prod(sensor.film().crop_size())), SPP, DEPTH)
-    image = olpm_bench.integrator(max_depth=DEPTH, **settings).render_paths(scene, sensor, 3, SPP, paths)
+    integrator = olpm_bench.integrator(max_depth=DEPTH, **settings)
+    integrator.paths_a_lane = lambda sensor, spp: paths_a_lane
+    paths = CameraPaths(int(np.prod(sensor.film().crop_size())), SPP, DEPTH, paths_a_lane)
+    image = integrator.render_paths(scene, sensor, 3, SPP, paths)
     dr.eval(image)
     paths.propagate()
     return image, paths
@@ -35,10 +37,10 @@ def _vertices(paths: CameraPaths) -> dict[str, np.ndarray]:
     return found
 
 
-@pytest.mark.parametrize("roulette", ["none", "throughput"])
-def test_radiance_is_propagated_from_the_end_of_each_path(roulette):
+@pytest.mark.parametrize(("roulette", "paths_a_lane"), [("none", 1), ("throughput", 1), ("throughput", 4)])
+def test_radiance_is_propagated_from_the_end_of_each_path(roulette, paths_a_lane):
     """The recursion in NumPy; and what arrives at the camera is the image."""
-    image, paths = _render(box(grey(ALBEDO), light=POINT), roulette=roulette, rr_depth=2)
+    image, paths = _render(box(grey(ALBEDO), light=POINT), paths_a_lane, roulette=roulette, rr_depth=2)
     v = {name: np.nan_to_num(array) for name, array in _vertices(paths).items()}
     radiance = np.zeros((paths.n_paths, 3))
     luminance = np.array(mi.luminance(mi.Color3f(np.eye(3, dtype=np.float32))))
@@ -65,10 +67,11 @@ def test_diffuse_surfaces_return_what_arrives():
     assert (dr.dot(direction, normal).numpy()[seen] > 0).all() and (distance.numpy()[seen] > 0).all()
 
 
-def test_vertices_are_bounded_and_evenly_spaced(monkeypatch):
+@pytest.mark.parametrize("paths_a_lane", [1, 8])
+def test_vertices_are_bounded_and_evenly_spaced(monkeypatch, paths_a_lane):
     """Of more paths than are kept, whole pixels are left out in even spacing."""
     monkeypatch.setattr(camera_paths, "MOST_PATHS", 1000)
-    _, paths = _render(box(grey(ALBEDO), lamp=lamp()), roulette="none")
+    _, paths = _render(box(grey(ALBEDO), lamp=lamp()), paths_a_lane, roulette="none")
     pixels = paths.n_paths // SPP
     assert paths.n_paths <= 1000 + SPP and pixels > 30
     assert len(paths.position) == 4 * paths.rows * paths.n_paths
