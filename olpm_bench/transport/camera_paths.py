@@ -7,8 +7,9 @@ estimation, and by how much the continuation was weighted.  A second kernel then
 
 so that every vertex knows an estimate of the radiance that arrived along its continuation.  Three things are learnt:
 
-* incident radiance, as particles of weight  L_i cos / p: like photons they estimate L_i cos, *without* the
-  share that next-event estimation will take care of (its own samples, and the MIS weight of emitters that were hit);
+* incident radiance, as particles of weight  L_i cos / p: like photons they estimate L_i cos, *without* the direct light
+  that next-event estimation takes care of.  What it samples too rarely is learnt (`wanted`), from its own samples and from
+  continuations that hit an emitter, by their MIS weights;
 * the radiance that each record returns on the average, for the roulette;
 * which share of it directions sampled by the BSDF bring, for the BSDF fraction.
 """
@@ -22,7 +23,23 @@ import mitsuba as mi
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
 from olpm_bench.transport.particles import UNBOUNDED_DEPTH, Particles, places
 
-MOST_PATHS = 2 ** 18        # kept of a pass; a vertex takes 96 bytes
+MOST_PATHS = 2 ** 18        # kept of a pass; a vertex takes 144 bytes
+
+
+def wanted(nee: mi.Float, value: mi.Float, reflected: mi.Float) -> mi.Float:
+    """Share of an emitter's light that the guide should learn although next-event estimation samples it, too.
+
+    One sample of each, weighted by the balance heuristic, has least variance where their densities add up to a multiple of
+    the integrand F = f cos L.  With the multiple 1 / I, I the integral of F, that is  p_guide = max(F / I - p_nee, 0):  of F
+    the share  max(1 - p_nee I / F, 0).  It is nearly 1 for the one patch of sky that shows between slats, where next-event
+    estimation samples the whole sky, and 0 for a lamp in plain view.
+
+    Args:
+        nee: density of next-event estimation, relative to that with which the direction was sampled.
+        value: F over that density.
+        reflected: the integral of F, the radiance that the record reflects on the average; 0: not known.
+    """
+    return dr.select((reflected > 0) & (value > 0), dr.maximum(1 - nee * reflected / value, 0), 0)
 
 
 class CameraPaths:
@@ -51,9 +68,10 @@ class CameraPaths:
         self.first = first * self.a_sample + pixel // opaque                # path of each lane; the next are `a_sample` apart
         self.n = dr.opaque(mi.UInt32, self.n_paths)
         size = 4 * self.rows * self.n_paths
-        self.position = dr.empty(mi.Float, size)        # and weight of the radiance estimate, filled in by `propagate`
-        self.direction = dr.empty(mi.Float, size)       # of the continuation, and its length
-        self.normal = dr.empty(mi.Float, size)          # on the incident side; probability that the BSDF chose, or -1
+        # Vertices, and in as many rows more what next-event estimation teaches at each
+        self.position = dr.zeros(mi.Float, 2 * size)    # and weight of the radiance estimate, filled in by `propagate`
+        self.direction = dr.empty(mi.Float, 2 * size)   # of the continuation, and its length
+        self.normal = dr.empty(mi.Float, 2 * size)      # on the incident side; probability that the BSDF chose, or -1
         self.weight = dr.empty(mi.Float, size)          # f cos / (p q) with the probability q of survival, and cos / (p q)
         self.reflected = dr.empty(mi.Float, size)       # by next-event estimation; radiance returned by the continuation
         self.emitted = dr.zeros(mi.Float, size)         # what the continuation hit, MIS weight included; unused
@@ -64,13 +82,29 @@ class CameraPaths:
         yield from (self.position, self.direction, self.normal, self.weight, self.reflected, self.emitted, self.count)
 
     def arrive(self, path: mi.UInt32, depth: mi.UInt32, ray: mi.Ray3f, t: mi.Float, emitted: mi.Spectrum,
-               active: mi.Bool) -> None:
+               nee: mi.Float, active: mi.Bool) -> None:
         """The continuation of the vertex before the one at `depth` of the lane's path has arrived, after a distance t
-        (infinity: nowhere)."""
+        (infinity: nowhere), where light is emitted that next-event estimation finds `nee` times as densely."""
         active = active & self.kept & (depth > 0) & (depth <= self.rows)
         place = (depth - 1) * self.n + self.first + path * self.a_sample
         dr.scatter(self.direction, mi.Vector4f(ray.d.x, ray.d.y, ray.d.z, t), place, active)
-        dr.scatter(self.emitted, mi.Vector4f(emitted.x, emitted.y, emitted.z, 0), place, active)
+        dr.scatter(self.emitted, mi.Vector4f(emitted.x, emitted.y, emitted.z, nee), place, active)
+
+    def light(self, path: mi.UInt32, depth: mi.UInt32, si: mi.SurfaceInteraction3f, bsdf: GuidedBSDF, ds: mi.DirectionSample3f,
+              weight: mi.Float, found: mi.Float, active: mi.Bool) -> None:
+        """What next-event estimation has found at a vertex.
+
+        Args:
+            weight: L / p of the emitter's sample, MIS weight included; found: f cos L / p, without.
+        """
+        share = wanted(1, found, bsdf.reflected)
+        active = active & self.kept & (depth < self.rows) & (share > 0) & ~ds.delta
+        place = (self.rows + depth) * self.n + self.first + path * self.a_sample
+        n = dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))
+        weight = weight * share * dr.maximum(dr.dot(n, ds.d), 0)
+        dr.scatter(self.position, mi.Vector4f(si.p.x, si.p.y, si.p.z, weight), place, active)
+        dr.scatter(self.direction, mi.Vector4f(ds.d.x, ds.d.y, ds.d.z, ds.dist), place, active)
+        dr.scatter(self.normal, mi.Vector4f(n.x, n.y, n.z, -1), place, active)
 
     def leave(self, path: mi.UInt32, depth: mi.UInt32, si: mi.SurfaceInteraction3f, bsdf: GuidedBSDF, bs: mi.BSDFSample3f,
               weight: mi.Spectrum, survive: mi.Float, reflected: mi.Spectrum, active: mi.Bool) -> None:
@@ -85,7 +119,7 @@ class CameraPaths:
         dr.scatter(self.position, mi.Vector4f(si.p.x, si.p.y, si.p.z, 0), place, active)
         dr.scatter(self.normal, mi.Vector4f(n.x, n.y, n.z, bsdf.chosen_by_bsdf), place, active)
         dr.scatter(self.weight, mi.Vector4f(weight.x, weight.y, weight.z, per_pdf), place, active)
-        dr.scatter(self.reflected, mi.Vector4f(reflected.x, reflected.y, reflected.z, 0), place, active)
+        dr.scatter(self.reflected, mi.Vector4f(reflected.x, reflected.y, reflected.z, bsdf.reflected / survive), place, active)
         dr.scatter(self.count, depth + 1, path, active)
 
     @dr.syntax
@@ -100,9 +134,12 @@ class CameraPaths:
             weight = dr.gather(mi.Vector4f, self.weight, place)
             reflected = dr.gather(mi.Vector4f, self.reflected, place)
             emitted = dr.gather(mi.Vector4f, self.emitted, place)
-            incident = mi.Spectrum(emitted.x, emitted.y, emitted.z) + radiance
-            returned = mi.Spectrum(weight.x, weight.y, weight.z) * incident
-            dr.scatter(self.position, mi.luminance(incident) * weight.w, 4 * place + 3)
+            source, factor = mi.Spectrum(emitted.x, emitted.y, emitted.z), mi.Spectrum(weight.x, weight.y, weight.z)
+            mis = dr.rcp(1 + dr.square(emitted.w))
+            value = mi.luminance(factor * source)
+            share = mis * dr.select(reflected.w > 0, wanted(emitted.w, value, reflected.w), 1)
+            returned = factor * (source * mis + radiance)
+            dr.scatter(self.position, (mi.luminance(source) * share + mi.luminance(radiance)) * weight.w, 4 * place + 3)
             dr.scatter(self.reflected, mi.luminance(returned), 4 * place + 3)
             radiance = mi.Spectrum(reflected.x, reflected.y, reflected.z) + returned
         dr.eval(self.position, self.reflected)
@@ -111,6 +148,17 @@ class CameraPaths:
         """All vertices, path by path, as particles that carry the radiance that arrived (`propagate` comes first)."""
         return Particles(self.position, self.direction, self.normal, places(self.count, self.rows), self.n_paths)
 
-    def returned(self, place: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-        """Luminance returned by the continuation of vertices, and the probability that the BSDF chose it, or -1."""
-        return dr.gather(mi.Float, self.reflected, 4 * place + 3), dr.gather(mi.Float, self.normal, 4 * place + 3)
+    def lessons(self) -> Particles:
+        """The same with what next-event estimation found, still path by path: all that there is to learn radiance from."""
+        vertex = places(self.count, self.rows)
+        either = dr.arange(mi.UInt32, 2 * len(vertex))
+        place = dr.gather(mi.UInt32, vertex, either // 2) + either % 2 * dr.opaque(mi.UInt32, self.rows * self.n_paths)
+        place = dr.gather(mi.UInt32, place, dr.compress(dr.gather(mi.Float, self.position, 4 * place + 3) > 0))
+        return Particles(self.position, self.direction, self.normal, place, self.n_paths)
+
+    def returned(self, place: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Luminance returned by the continuation of vertices, the probability that the BSDF chose it, or -1, and luminance
+        reflected in all."""
+        reflected = dr.gather(mi.Vector4f, self.reflected, place)
+        by_nee = mi.luminance(mi.Spectrum(reflected.x, reflected.y, reflected.z))
+        return reflected.w, dr.gather(mi.Float, self.normal, 4 * place + 3), by_nee + reflected.w

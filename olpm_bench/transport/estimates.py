@@ -41,6 +41,7 @@ class Estimates:
     camera_count: mi.Float
     visits: mi.Float                # of camera paths
     returned: mi.Float              # mean luminance that their continuations bring back
+    reflected: mi.Float             # and with that of next-event estimation
     by_either: mi.Float             # of guided visits, decaying: sum of w, ...
     by_bsdf: mi.Float               # ... and of w gamma_bsdf
 
@@ -68,12 +69,14 @@ class Estimates:
         self.camera_weight, self.camera_count = _advance(self.camera_weight, self.camera_count, batch)
         return _relative(batch, self.camera_weight, MOST)
 
-    def learn(self, returned: mi.Float, chosen_by_bsdf: mi.Float, offset: mi.UInt32) -> None:
+    def learn(self, returned: mi.Float, chosen_by_bsdf: mi.Float, reflected: mi.Float, offset: mi.UInt32) -> None:
         """From visits of camera paths grouped by record: luminance returned, probability of the BSDF (-1: unguided)."""
         n, total = _visit_sums(returned, offset)
         self.visits = self.visits + n
         self.returned = _mean(self.returned, total, n, self.visits)
-        dr.eval(self.visits, self.returned)
+        n, total = _visit_sums(reflected, offset)
+        self.reflected = _mean(self.reflected, total, n, self.visits)
+        dr.eval(self.visits, self.returned, self.reflected)
         either, bsdf = _fraction_sums(returned, chosen_by_bsdf, offset, MOST * self.returned)
         self.by_either, self.by_bsdf = MEMORY * self.by_either + either, MEMORY * self.by_bsdf + bsdf
         dr.eval(self.by_either, self.by_bsdf)

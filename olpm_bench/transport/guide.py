@@ -14,7 +14,7 @@ import numpy as np
 import representations
 from olpm_bench.transport import radius
 from olpm_bench.transport.cache import RecordCache
-from olpm_bench.transport.estimates import Estimates
+from olpm_bench.transport.estimates import ENOUGH, Estimates
 from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.settings import InputError
 from representations import state as states
@@ -24,7 +24,7 @@ from representations.state import copied
 if TYPE_CHECKING:
     from olpm_bench.transport.gather import Gathered
 
-FORMAT = 4              # of guide files
+FORMAT = 5              # of guide files
 MIN_PARTICLES = 80      # records that have seen fewer leave the surface to its BSDF; the mixture's first fit needs as many
 
 
@@ -44,6 +44,7 @@ class GuidedPoint:
         self.guide, self.record, self.frame, self.found, self.at = guide, record, frame, found, at
         row = dr.gather(mi.Vector4f, guide.rows, record, found)
         self.valid, self.fraction, self.outgoing = row.x > 0, row.y, dr.select(found, row.z, -1)
+        self.reflected = row.w
 
     def sample(self, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Bool]:
         """A direction distributed by `pdf`, and whether there is one: samples may fail."""
@@ -65,11 +66,13 @@ class Guide:
         specification: the representation, as in a TOML: ``{"type": "gaussian_mixture", "components": 8}``.
         fraction: initial BSDF fraction of records that learn it; None: they do not.
         parallax: tell the representation where around a record it is asked, and where its particles landed.
+        direct: learn direct light that next-event estimation finds too rarely.
     """
 
     def __init__(self, cache: RecordCache, specification: dict[str, Any], fraction: float | None = None,
-                 parallax: bool = False) -> None:
+                 parallax: bool = False, direct: bool = False) -> None:
         self.cache, self.specification, self.fraction, self.parallax = cache, specification, fraction, parallax
+        self.direct = direct
         self.representation = representations.create(**specification)
         self.state = self.representation.init(0, 0, parallax)
         self.count = dr.zeros(mi.UInt32, 0)     # particles seen by each record, or by the one that it began as a copy of
@@ -131,15 +134,15 @@ class Guide:
             self.estimates.learn_fluence(batch, self.areas() * dr.opaque(mi.Float, emitted))
             self._update(self.estimates.normalise_particles(batch), seed)
 
-    def learn_camera(self, batch: ParticleBatch, returned: mi.Float, chosen_by_bsdf: mi.Float, offset: mi.UInt32,
-                     seed: int) -> None:
+    def learn_camera(self, batch: ParticleBatch, returned: mi.Float, chosen_by_bsdf: mi.Float, reflected: mi.Float,
+                     offset: mi.UInt32, seed: int) -> None:
         """One on-line update with the camera paths of one pass.
 
         Args:
             batch: estimates of incident radiance.
-            returned, chosen_by_bsdf, offset: of all vertices, see :meth:`Estimates.learn`.
+            returned, chosen_by_bsdf, reflected, offset: of all vertices, see :meth:`Estimates.learn`.
         """
-        self.estimates.learn(returned, chosen_by_bsdf, offset)
+        self.estimates.learn(returned, chosen_by_bsdf, reflected, offset)
         if len(batch):
             batch = self.estimates.normalise_camera(batch)
         self._update(batch, seed)
@@ -156,7 +159,8 @@ class Guide:
         """Bring the rows for queries up to date."""
         c = self.estimates.fraction(self.fraction) if self.fraction is not None else dr.zeros(mi.Float, self.records)
         outgoing = self.estimates.outgoing(self.cache.points[:, :3])
-        self.rows = dr.ravel(mi.Vector4f(dr.select(self.count >= MIN_PARTICLES, mi.Float(1), 0), c, outgoing, 0))
+        reflected = dr.select((self.estimates.visits >= ENOUGH) & self.direct, self.estimates.reflected, 0)
+        self.rows = dr.ravel(mi.Vector4f(dr.select(self.count >= MIN_PARTICLES, mi.Float(1), 0), c, outgoing, reflected))
         dr.eval(self.rows)
 
     def fluence_at(self, p: mi.Point3f, n: mi.Normal3f) -> mi.Float:

@@ -42,13 +42,13 @@ class GuidedBSDF:
         self.bsdf, self.si = bsdf, si
         self.smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         self.guided: GuidedPoint | None = None
-        self.outgoing, self.chosen_by_bsdf = mi.Float(-1), mi.Float(-1)
+        self.outgoing, self.reflected, self.chosen_by_bsdf = mi.Float(-1), mi.Float(0), mi.Float(-1)
         if guide is not None and guide.records:
             n = dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))       # geometric normal, turned to the incident side
             self.guided = guide.at(si.p, n, self.smooth)
             learnt = self.guided.fraction
             self.fraction = dr.select(self.guided.valid, dr.select(learnt > 0, learnt, fraction), 1)
-            self.outgoing = self.guided.outgoing
+            self.outgoing, self.reflected = self.guided.outgoing, self.guided.reflected
 
     def eval_pdf_sample(self, ctx: mi.BSDFContext, wo: mi.Vector3f, sample1: mi.Float, sample2: mi.Point2f,
                         active: mi.Bool) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:

@@ -119,10 +119,10 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             ds = mi.DirectionSample3f(scene, si, si_prev)
             emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, active & ~delta_prev)
             visible = active & ~((depth == 0) & self.hide_emitters)
-            emitted = mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, visible) & visible
-            L += beta * emitted
+            emitted = ds.emitter.eval(si, visible) & visible
+            L += beta * mis_weight(pdf_prev, emitter_pdf) * emitted
             if dr.hint(log is not None, mode="scalar"):
-                log.arrive(path, depth, ray, si.t, emitted, active)
+                log.arrive(path, depth, ray, si.t, emitted, emitter_pdf / pdf_prev, active)
 
             # Emitters on the surface are hit even at the last depth; everything below needs one more segment.
             active_next = active & si.is_valid() & (depth + 1 < max_depth)
@@ -137,8 +137,11 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             value, pdf_em, bs, weight = bsdf.eval_pdf_sample(
                 ctx, si.to_local(ds.d), sampler.next_1d(active_next), sampler.next_2d(active_next), active_next)
             mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_em))
-            reflected = value * weight_em * mis_em & active_em
+            found = value * weight_em & active_em
+            reflected = found * mis_em
             L += beta * reflected
+            if dr.hint(log is not None, mode="scalar"):
+                log.light(path, depth, si, bsdf, ds, mi.luminance(weight_em) * mis_em, mi.luminance(found), active_em)
 
             # ---------------------- Roulette ----------------------
             survive = mi.Float(1)                       # probability of going on

@@ -83,6 +83,7 @@ class TrainingSettings:
         paper; off by default: at equal time it costs more than it gains.
     fraction: probability of sampling the BSDF rather than the guide when particles scatter.
     learn_fraction: learn it from camera paths, record by record, for camera paths and importons.
+    learn_direct: from camera paths, learn the direct light too that next-event estimation samples more rarely than it brings.
     emission: "guided" starts photons of lights at infinity (constant, envmap, sunsky, directional) where importons leave for
         them; "emitter" by the emitters' own samplers.
     emission_fraction: probability of the emitter's own sampler in guided emission, its defensive share [T 113-117].
@@ -106,6 +107,7 @@ class TrainingSettings:
     shrink: bool = False
     fraction: float = 0.5
     learn_fraction: bool = True
+    learn_direct: bool = True
     emission: Literal["guided", "emitter"] = "guided"
     emission_fraction: float = 0.2
     weight_window: Literal["flux", "contribution"] = "contribution"

@@ -33,8 +33,6 @@ from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings
 from olpm_bench.transport.window import by_contribution
 
-LUMINANCE = (0.212671, 0.715160, 0.072169)      # of linear sRGB, as mi.luminance
-
 
 @dataclass
 class PassStatistics:
@@ -59,7 +57,8 @@ class PassStatistics:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: all but the image."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "image"}
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "image"}
+        return plain | {"regions": {kind: counts.tolist() for kind, counts in self.regions.items()}}
 
 
 def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixture",
@@ -145,7 +144,8 @@ class Training:
         specification = {"type": representation} if isinstance(representation, str) else dict(representation)
         bounds = surface_bounds(scene)
         self.radiance = Guide(RecordCache(bounds, settings.record_radius), specification,
-                              integrator.fraction if settings.learn_fraction else None, settings.parallax)
+                              integrator.fraction if settings.learn_fraction else None, settings.parallax,
+                              settings.learn_direct)
         self.importance = Guide(RecordCache(bounds, settings.record_radius), specification, parallax=settings.parallax)
         self.integrator = GuidedPathIntegrator(integrator, self.radiance)
         self.luminance: np.ndarray | None = None        # of the mean of all camera passes so far (h, w), ...
@@ -261,7 +261,7 @@ class Training:
                 p, _, _, _, n = vertices.read(vertices.place)
                 guide.grow(p, n, mi.Bool(True), self._next_seed())
             with _Seconds(statistics, "gather"):
-                batch = binned(guide.cache, vertices, self.settings.neighbours, self.settings.parallax)
+                batch = binned(guide.cache, paths.lessons(), self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
             with _Seconds(statistics, "update"):
                 guide.learn_camera(batch, *paths.returned(place), offset, self._next_seed())
@@ -277,7 +277,8 @@ class Training:
 
     def _estimate_pixels(self, image: mi.TensorXf, spp: int) -> None:
         """Tell the guide what pixels are worth, from all camera passes so far."""
-        luminance = np.asarray(image.numpy(), np.float64)[..., :3] @ LUMINANCE
+        grey = mi.Bitmap(image).convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, srgb_gamma=False)
+        luminance = np.array(grey, np.float64).reshape(image.shape[:2])
         before = 0.0 if self.luminance is None else self.luminance
         self.spp += spp
         self.luminance = before + (luminance - before) * spp / self.spp

@@ -5,11 +5,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import box, grey, lamp
+from small_scenes import box, camera, grey, lamp, wall
 
 import olpm_bench
-from olpm_bench.transport import camera_paths
+from olpm_bench.transport import camera_paths, settings
 from olpm_bench.transport.camera_paths import CameraPaths
+from olpm_bench.transport.training import Training
 
 ALBEDO, DEPTH, SPP = 0.6, 6, 16
 POINT = {"type": "point", "position": [0.3, 0.4, 0.3], "intensity": 1.0}        # which no path can hit
@@ -32,7 +33,7 @@ def _vertices(paths: CameraPaths) -> dict[str, np.ndarray]:
     unused = np.arange(paths.rows)[:, None] >= paths.count.numpy()
     found = {}
     for name in ("position", "direction", "normal", "weight", "reflected", "emitted"):
-        found[name] = getattr(paths, name).numpy().reshape(paths.rows, paths.n_paths, 4).astype(float)
+        found[name] = getattr(paths, name).numpy()[:4 * unused.size].reshape(paths.rows, paths.n_paths, 4).astype(float)
         found[name][unused] = np.nan
     return found
 
@@ -45,7 +46,8 @@ def test_radiance_is_propagated_from_the_end_of_each_path(roulette, paths_a_lane
     radiance = np.zeros((paths.n_paths, 3))
     luminance = np.array(mi.luminance(mi.Color3f(np.eye(3, dtype=np.float32))))
     for row in reversed(range(paths.rows)):
-        incident = v["emitted"][row, :, :3] + radiance
+        emitted, nee = v["emitted"][row, :, :3], v["emitted"][row, :, 3:]
+        incident = emitted / (1 + nee ** 2) + radiance
         returned = v["weight"][row, :, :3] * incident
         np.testing.assert_allclose(v["position"][row, :, 3], incident @ luminance * v["weight"][row, :, 3], rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(v["reflected"][row, :, 3], returned @ luminance, rtol=1e-4, atol=1e-7)
@@ -59,12 +61,34 @@ def test_diffuse_surfaces_return_what_arrives():
     _, paths = _render(box(grey(ALBEDO), light=POINT), roulette="none")
     particles = paths.particles()
     _, weight, direction, distance, normal = particles.read(particles.place)
-    returned, chosen_by_bsdf = paths.returned(particles.place)
+    returned, chosen_by_bsdf, reflected = paths.returned(particles.place)
+    assert (reflected.numpy() >= returned.numpy()).all() and reflected.numpy().sum() > 2 * returned.numpy().sum()
     np.testing.assert_allclose(returned.numpy(), ALBEDO / np.pi * weight.numpy(), rtol=1e-3, atol=1e-6)
     assert len(particles) > 5_000 and weight.numpy().max() > 0
     assert (chosen_by_bsdf.numpy() == -1).all()                 # nobody guided
     seen = weight.numpy() > 0
     assert (dr.dot(direction, normal).numpy()[seen] > 0).all() and (distance.numpy()[seen] > 0).all()
+
+
+def test_direct_light_that_the_guide_learns():
+    """A floor under a white sky, which next-event estimation samples with density 1 / 4 pi: cos - 1 / 4 is left to learn."""
+    content = {"type": "scene", "sensor": camera(), "floor": wall((0, 0, -1), (0, 0, 1), 50, bsdf=grey(ALBEDO)),
+               "sky": {"type": "constant"}}
+    scene = mi.load_dict(content, optimize=False)
+    learnt = {}
+    for direct in (True, False):
+        training = Training(scene, "gaussian_mixture", settings.training(passes=0, camera_paths=2**15, learn_direct=direct),
+                            settings.integrator(max_depth=DEPTH))
+        for _ in range(3):
+            training.camera_pass()
+        paths = CameraPaths(training.pixels, 64, DEPTH)
+        dr.eval(training.integrator.render_paths(scene, training.sensor, 7, 64, paths))
+        paths.propagate()
+        lessons = paths.lessons()
+        learnt[direct] = lessons.read(lessons.place)[1].numpy().sum() / len(paths.particles())
+        assert (len(lessons) > len(paths.particles())) == direct
+    assert learnt[True] == pytest.approx(2 * np.pi * ((1 - 1 / 16) / 2 - 3 / 16), rel=0.02)
+    assert learnt[False] > 0
 
 
 @pytest.mark.parametrize("paths_a_lane", [1, 8])
@@ -74,7 +98,7 @@ def test_vertices_are_bounded_and_evenly_spaced(monkeypatch, paths_a_lane):
     _, paths = _render(box(grey(ALBEDO), lamp=lamp()), paths_a_lane, roulette="none")
     pixels = paths.n_paths // SPP
     assert paths.n_paths <= 1000 + SPP and pixels > 30
-    assert len(paths.position) == 4 * paths.rows * paths.n_paths
+    assert len(paths.position) == 8 * paths.rows * paths.n_paths           # vertices, and what is learnt of their direct light
     assert (paths.count.numpy() == paths.rows).mean() > 0.9
     first = _vertices(paths)["position"][0, :pixels, :3]
     assert np.isfinite(first).all() and len(np.unique(first, axis=0)) == pixels

@@ -59,9 +59,10 @@ def test_fraction_is_the_share_of_the_bsdf():
     returned = mi.Float(np.ones(10_000, np.float32))
     gamma = mi.Float(np.repeat([0.3, 1.0], 5_000).astype(np.float32))
     for _ in range(5):
-        found.learn(returned, gamma, offset)
+        found.learn(returned, gamma, 2 * returned, offset)
     np.testing.assert_allclose(found.fraction(0.5).numpy(), [0.3, 1 - estimates.FLOOR, 0.5], atol=0.01)
     np.testing.assert_allclose(found.returned.numpy(), [1, 1, 0], rtol=1e-5)
+    np.testing.assert_allclose(found.reflected.numpy(), [2, 2, 0], rtol=1e-5)
 
 
 def test_records_with_few_visits_ask_their_neighbours():
