@@ -37,6 +37,8 @@ class Gathered(ParticleBatch):
 
 def binned(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
     """The particles that fall to each record, at most `neighbours` a record."""
+    if len(particles) == 0:
+        return _nothing(cache)
     p, weight, d, _, n = particles.read(particles.place)
     record, normal, valid = cache.lookup(p, n, weight > 0)
     valid &= dr.dot(d, normal) >= MIN_ELEVATION
