@@ -28,6 +28,8 @@ ResultsFolder = Annotated[Path, typer.Option(
     "--results", metavar="DIR", help="Results go to DIR/<stem of the TOML>, references to DIR/references.")]
 Replacements = Annotated[list[str], typer.Option(
     "--scene", metavar="NAME=PATH", help="Read the scene NAME of the experiment from another XML.")]
+Scale = Annotated[str | None, typer.Option(
+    "--scale", metavar="NAME", help="Run it at another of its scales, [scale.NAME] of the file; results in DIR/<stem>-NAME.")]
 Only = Annotated[list[str], typer.Option("--only-scene", metavar="NAME", help="Leave the other scenes for later.")]
 Assignments = Annotated[list[str], typer.Option(
     "--set", metavar="TABLE.KEY=VALUE", help="Change a setting; keys as in the TOML.")]
@@ -73,8 +75,8 @@ def _interrupt(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def _load(path: Path, replacements: list[str] | None = None) -> Any:
-    """The experiment, with `NAME=PATH` options applied."""
+def _load(path: Path, replacements: list[str] | None = None, scale: str | None = None) -> Any:
+    """The experiment, at a scale of its own if one is named, with `NAME=PATH` options applied."""
     from olpm_bench.bench import config
 
     scenes = {}
@@ -87,18 +89,19 @@ def _load(path: Path, replacements: list[str] | None = None) -> Any:
         from olpm_bench.bench import environment
 
         environment.select_variant()            # other people's file may name Mitsuba's types when it is imported
-    return config.load(path, scenes)
+    return config.load(path, scenes, scale)
 
 
 @command
 def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
         only: Only = [],  # noqa: B006
+        scale: Scale = None,
         dry_run: Annotated[bool, typer.Option("--dry-run", help="Print cells, hours and memory; run nothing.")] = False,
         ) -> None:
     """Run an experiment, or what is missing of it; then print its table and draw its figures."""
     from olpm_bench.bench import environment
 
-    loaded = _load(experiment, scene)
+    loaded = _load(experiment, scene, scale)
     environment.select_variant()
     from olpm_bench.bench import run as runner
 
@@ -121,11 +124,12 @@ def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), sc
 
 @command
 def reference(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
+              scale: Scale = None,
               seconds: Annotated[float, typer.Option(min=1.0, help="Charged seconds for each scene.")] = 300.0) -> None:
     """Make or improve the references of an experiment: two unguided halves, resumable."""
     from olpm_bench.bench import environment
 
-    loaded = _load(experiment, scene)
+    loaded = _load(experiment, scene, scale)
     environment.select_variant()
     from olpm_bench.bench import reference as references
 

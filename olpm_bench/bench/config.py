@@ -12,15 +12,15 @@ import hashlib
 import importlib.metadata
 import inspect
 import json
-import math
 import os
 import shlex
 import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import tomli_w
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -35,10 +35,13 @@ import representations
 from olpm_bench import scenes as embedded
 from olpm_bench import transport
 from olpm_bench.bench.results import SCHEMA_VERSION, slug
+from olpm_bench.bench.scale import scaled
+from olpm_bench.bench.sweep import expanded
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, preset_of, with_changes
 
-MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see run.pass_seed
+MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see cell.pass_seed
 NO_REFERENCE = Path("none")
+LOOKS = 8                   # methods that the figures' style tells apart
 
 
 class ConfigError(InputError):
@@ -116,16 +119,35 @@ class Scene(Table):
         return embedded.digest(self.file or self.name, self.arguments)
 
 
+class Series(Table):
+    """Where a method stands in the sweep that it comes from: the name before the sweep, the setting, and its value."""
+    name: str
+    setting: str
+    value: float = Field(gt=0, allow_inf_nan=False)
+
+
+class SweepFigure(Table):
+    """What is drawn of methods that sweep a setting, a panel for each of `y`.
+
+    x: the setting's value, or the photons traced in training.
+    y: "bytes" are those of the guide and of the most particles stored at once.
+    """
+    x: Literal["setting", "photons"] = "setting"
+    y: list[Literal["l1", "relmse", "bytes", "train_seconds"]] = Field(default=["l1"], min_length=1)
+
+
 class Method(Table):
     """A method under test: the path tracer with one representation, or without a guide.
 
     representation: ``{ type = name, ...hyper-parameters }``; none traces unguided.
     integrator, training: what differs from the experiment's own tables.
+    series: of a method that a ``sweep`` has made, see :mod:`olpm_bench.bench.sweep`.
     """
     name: str = Field(min_length=1)
     representation: dict[str, Any] | None = None
     integrator: dict[str, Any] = {}
     training: dict[str, Any] = {}
+    series: Series | None = None
 
     @model_validator(mode="after")
     def _sensible(self) -> Method:
@@ -192,6 +214,8 @@ class Experiment(Table):
     """A whole experiment file.  `seeds = 3` means seeds 0, 1, 2.
 
     baseline: the method that gains and speed-ups are over; the first by default.
+    sweep: how methods with a sweep are drawn.
+    scale: other sizes of it, see :mod:`olpm_bench.bench.scale`.
     """
     schema_version: int = SCHEMA_VERSION
     title: str
@@ -203,12 +227,24 @@ class Experiment(Table):
     integrator: IntegratorSettings = IntegratorSettings()
     training: TrainingSettings = TrainingSettings()
     method: list[Method] = Field(min_length=1)
+    sweep: SweepFigure = SweepFigure()
+    scale: dict[str, dict[str, Any]] = {}
     _path: Path = PrivateAttr(Path("EXPERIMENT.toml"))
+    _scale: str | None = PrivateAttr(None)
 
     @property
     def path(self) -> Path:
         """The file it was read from."""
         return self._path
+
+    @property
+    def stem(self) -> str:
+        """Name of its results folder: the file's, and the scale's."""
+        return self.path.stem if self._scale is None else f"{self.path.stem}-{slug(self._scale)}"
+
+    def command(self, name: str) -> list[str]:
+        """Words of the command `name` of this experiment, for messages."""
+        return ["olpm-bench", name, str(self.path), *(["--scale", self._scale] if self._scale is not None else [])]
 
     @field_validator("schema_version")
     @classmethod
@@ -235,8 +271,8 @@ class Experiment(Table):
 
     @model_validator(mode="before")
     @classmethod
-    def _presets(cls, data: Any) -> Any:
-        return _without_presets(data) if isinstance(data, dict) else data
+    def _resolve(cls, data: Any) -> Any:
+        return _without_presets(_without_sweeps(data)) if isinstance(data, dict) else data
 
     @model_validator(mode="after")
     def _distinct(self) -> Experiment:
@@ -261,6 +297,12 @@ class Experiment(Table):
     def baseline_name(self) -> str:
         """The method that the others are compared with."""
         return self.method[0].name if self.baseline is None else self.baseline
+
+    @property
+    def shown(self) -> list[Method]:
+        """The methods that figures of single methods show: all, or where these are too many, of each sweep the last."""
+        last = {m.series.name: m for m in self.method if m.series is not None}
+        return [m for m in self.method if len(self.method) <= LOOKS or m.series is None or last[m.series.name] is m]
 
     def integrator_of(self, scene: Scene, method: Method) -> IntegratorSettings:
         changes = dict(method.integrator)
@@ -332,16 +374,34 @@ class Experiment(Table):
                 table["training"] = dataclasses.asdict(training)
             integrator = dataclasses.asdict(self.integrator_of(self.scene[0], method))
             table["integrator"] = {k: v for k, v in integrator.items() if k != "max_depth"}
+            if method.series is not None:
+                table["series"] = method.series.model_dump()
             methods.append(table)
         return {
             "schema_version": SCHEMA_VERSION, "title": self.title, "description": self.description, "seeds": self.seeds,
             "baseline": self.baseline_name, "budget": self.budget.model_dump(exclude_none=True),
             "integrator": dataclasses.asdict(self.integrator), "training": dataclasses.asdict(self.training),
-            "scene": scenes, "method": methods}
+            "sweep": self.sweep.model_dump(), "scene": scenes, "method": methods}
 
     def toml(self, relative_to: Path | None = None) -> str:
         """`resolved` as TOML; reading it back gives the same cells."""
-        return "\n".join(_toml_lines(self.resolved(relative_to))) + "\n"
+        return tomli_w.dumps(_without_none(self.resolved(relative_to)))
+
+
+def _without_sweeps(data: dict[str, Any]) -> dict[str, Any]:
+    """The experiment with every method that sweeps a setting replaced by the methods that it stands for.
+
+    Raises:
+        InputError: by `sweep.expanded`, or a name that is also that of another method.
+    """
+    methods = data.get("method")
+    if not isinstance(methods, list):
+        return data
+    names = [method.get("name") for method in _tables(methods)]
+    for method in _tables(methods):
+        if "sweep" in method and names.count(method.get("name")) > 1:
+            raise InputError(f"two methods of one name {method.get('name')!r}; names must differ")
+    return data | {"method": [m for method in methods for m in (expanded(method) if isinstance(method, dict) else [method])]}
 
 
 def _without_presets(data: dict[str, Any]) -> dict[str, Any]:
@@ -392,12 +452,13 @@ def reference_key(scene: Scene, max_depth: int) -> str:
     return f"{slug(scene.name)}-{scene.width}x{scene.height}-{digest[:8]}"
 
 
-def load(path: Path | str, scenes: dict[str, Path] | None = None) -> Experiment:
+def load(path: Path | str, scenes: dict[str, Path] | None = None, scale: str | None = None) -> Experiment:
     """Read and check an experiment file.
 
     Args:
         path: the TOML; the paths in it are relative to its folder.
         scenes: name of a scene of the file -> XML to use in its place.
+        scale: one of the file's scales; as the file stands by default.
 
     Raises:
         ConfigError: anything wrong with the file, with the files it names, or with `scenes`.
@@ -411,8 +472,14 @@ def load(path: Path | str, scenes: dict[str, Path] | None = None) -> Experiment:
         raise ConfigError(f"experiment file {path}: cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not valid TOML: {error}") from None
-    experiment = parse(data, path.name, path.parent, scenes or {})
-    experiment._path = path
+    source = path.name
+    if scale is not None:
+        try:
+            data, source = scaled(data, scale, source), f"{source} --scale {scale}"
+        except InputError as error:
+            raise ConfigError(str(error)) from None
+    experiment = parse(data, source, path.parent, scenes or {})
+    experiment._path, experiment._scale = path, scale
     return experiment
 
 
@@ -493,7 +560,7 @@ def _check_scene(scene: Scene, source: str, replaceable: bool) -> None:
         raise ConfigError(f"{where}: reference {scene.reference}: there is no such file or folder; \"none\" does without")
 
 
-TABLES = {"budget": Budget, "scene": Scene, "method": Method,
+TABLES = {"budget": Budget, "scene": Scene, "method": Method, "sweep": SweepFigure,
           "integrator": IntegratorSettings, "training": TrainingSettings}
 
 
@@ -517,6 +584,8 @@ def _explain(error: ValidationError, source: str) -> str:
         known = list(cls.model_fields) if issubclass(cls, BaseModel) else [f.name for f in dataclasses.fields(cls)]
         if cls is TrainingSettings:
             known.insert(0, "preset")
+        if cls is Method:
+            known.append("sweep")
         return f"unknown key '{keys[-1]}' in {where}; known: {', '.join(known)}"
     if first["type"] in ("missing", "missing_argument"):
         return f"missing key '{keys[-1]}' in {where}" if keys else f"missing table '{table}' in {source}"
@@ -550,48 +619,27 @@ def _representation_defaults(method: Method) -> dict[str, Any] | None:
     return {**defaults, **method.representation}
 
 
+def _without_none(value: Any) -> Any:
+    """`value` without the keys that have no value, which TOML cannot say."""
+    if isinstance(value, dict):
+        return {k: _without_none(v) for k, v in value.items() if v is not None}
+    return [_without_none(v) for v in value] if isinstance(value, list) else value
+
+
 def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 @functools.cache
 def own_code() -> str:
-    """Hash of the sources of path tracing, training and representations, so that figures never mix versions."""
-    folders = (Path(package.__path__[0]) for package in (transport, representations))
-    return _hash([[f.name, f.read_text(encoding="utf-8")] for folder in folders for f in sorted(folder.glob("*.py"))])
+    """Hash of the sources of cells, path tracing, training and representations, so that figures never mix versions."""
+    files = [Path(__file__).with_name("cell.py")]
+    for package in (transport, representations):
+        files += sorted(Path(package.__path__[0]).glob("*.py"))
+    return _hash([[file.name, file.read_text(encoding="utf-8")] for file in files])
 
 
 def _representation_code(method: Method) -> str | None:
     """The source behind ``FILE.py:Class``; a registered name stands for itself."""
     kind = method.representation_name
     return hashlib.sha256(Path(kind.rpartition(":")[0]).read_bytes()).hexdigest() if kind and ".py:" in kind else None
-
-
-def _toml_lines(data: dict[str, Any]) -> Iterator[str]:
-    tables = {k: v for k, v in data.items() if isinstance(v, dict)}
-    arrays = {k: v for k, v in data.items() if isinstance(v, list) and v and all(isinstance(t, dict) for t in v)}
-    for key, value in data.items():
-        if key not in tables and key not in arrays:
-            yield f"{_toml_key(key)} = {_toml_value(value)}"
-    named = [(f"[{_toml_key(key)}]", table) for key, table in tables.items()]
-    named += [(f"[[{_toml_key(key)}]]", table) for key, array in arrays.items() for table in array]
-    for head, table in named:
-        yield from ("", head, *(f"{_toml_key(k)} = {_toml_value(v)}" for k, v in table.items() if v is not None))
-
-
-def _toml_key(key: str) -> str:
-    return key if key and all(c.isascii() and (c.isalnum() or c in "_-") for c in key) else json.dumps(key)
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    if isinstance(value, dict):
-        items = ", ".join(f"{_toml_key(k)} = {_toml_value(v)}" for k, v in value.items() if v is not None)
-        return f"{{ {items} }}" if items else "{}"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_toml_value, value)) + "]"
-    return repr(value) if isinstance(value, (int, float)) else json.dumps(str(value))
-

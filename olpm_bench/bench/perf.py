@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 
 import representations
-from olpm_bench.bench.run import Kernels
+from olpm_bench.bench.cell import Kernels
 from olpm_bench.scenes.load import load
 from olpm_bench.transport import settings as options
 from olpm_bench.transport.guide import Guide

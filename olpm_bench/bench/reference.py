@@ -13,7 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from olpm_bench.bench import environment, run
+from olpm_bench.bench import cell, environment
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec, Experiment
 from olpm_bench.bench.progress import Bar
@@ -26,6 +26,7 @@ from olpm_bench.bench.results import (
     read_reference,
     write_reference,
 )
+from olpm_bench.bench.run import reference_folders
 
 ESTIMATOR = "path, unguided"
 SAVE_SECONDS = 30.0
@@ -101,8 +102,8 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
     folder = root / "references" / key
     with locked(folder):
         halves = Halves.start(spec.scene.width, spec.scene.height,
-                              find_reference(key, run.reference_folders(experiment, root)))
-        scene = run.load_scene(spec)
+                              find_reference(key, reference_folders(experiment, root)))
+        scene = cell.load_scene(spec)
         integrator = mi.load_dict({"type": "path", "max_depth": experiment.max_depth(spec.scene), "rr_depth": 5})
         meta = {"key": key, "scene": spec.scene.name, "width": spec.scene.width, "height": spec.scene.height,
                 "max_depth": experiment.max_depth(spec.scene), "parameters": spec.scene.resolved_arguments(),
@@ -114,9 +115,9 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
             while clock.charged < seconds or min(halves.a.passes, halves.b.passes) < 2:
                 for half, seed in ((halves.a, SEEDS["a"]), (halves.b, SEEDS["b"])):
                     with clock.lap("render"):
-                        rendered = run.render_pass(scene, integrator, seed + half.passes, spp)
-                    image = run.to_numpy(rendered)
-                    run.check_pixels(image, f"the pass with seed {seed + half.passes}")
+                        rendered = cell.render_pass(scene, integrator, seed + half.passes, spp)
+                    image = cell.to_numpy(rendered)
+                    cell.check_pixels(image, f"the pass with seed {seed + half.passes}")
                     half.add(image, spp)
                 halves.seconds = before + clock.charged
                 bar.at(done + clock.charged, f"{spec.scene.name}: {halves}")
@@ -132,13 +133,13 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
 
 def _spp_of_pass(spec: CellSpec, scene: mi.Scene, integrator: mi.Integrator, seconds: float) -> int:
     """Compile, and find the samples a pixel of a pass of about a second (less for short budgets)."""
-    spp, limit = 1, run.power_of_two(run.largest_pass(spec))
+    spp, limit = 1, cell.power_of_two(cell.largest_pass(spec))
     target = min(PASS_SECONDS, seconds / 8)
     while True:
-        run.render_pass(scene, integrator, run.WARM_UP_SEED, spp)           # compiles
+        cell.render_pass(scene, integrator, cell.WARM_UP_SEED, spp)          # compiles
         start = time.perf_counter()
-        run.render_pass(scene, integrator, run.WARM_UP_SEED + 1, spp)
+        cell.render_pass(scene, integrator, cell.WARM_UP_SEED + 1, spp)
         elapsed = time.perf_counter() - start
         if elapsed > target / 4 or spp >= limit:
-            return run.power_of_two(min(limit, spp * target / max(elapsed, 1e-6)))
+            return cell.power_of_two(min(limit, spp * target / max(elapsed, 1e-6)))
         spp = min(4 * spp, limit)

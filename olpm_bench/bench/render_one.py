@@ -8,7 +8,8 @@ from typing import Any
 import mitsuba as mi
 
 from olpm_bench import scenes
-from olpm_bench.bench import environment, run
+from olpm_bench.bench import environment
+from olpm_bench.bench.cell import load_scene, measure, warm_up
 from olpm_bench.bench.config import CellSpec, ConfigError, parse
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.results import replacing, write_exr
@@ -110,11 +111,11 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: there is no folder {path.parent}")
     guide = _load_guide(load_guide, spec) if load_guide is not None else None
-    scene = run.load_scene(spec)
+    scene = load_scene(spec)
     with Bar(1.0) as bar:
         bar.at(0.0, "compiling")
-        warm = run.warm_up(spec, scene, guide)
-        done = run.measure(spec, scene, warm, guide, bar.at)
+        warm = warm_up(spec, scene, guide)
+        done = measure(spec, scene, warm, guide, bar.at)
     config = spec.config()
     if guide is not None:
         config |= {"representation": guide.specification, "training": None}

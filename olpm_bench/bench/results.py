@@ -451,7 +451,7 @@ def find_reference(key: str, folders: list[Path]) -> Path | None:
 def read_reference(path: Path, width: int, height: int) -> Reference:
     """A reference folder, or an EXR of another renderer, for an image of `width` x `height`.
 
-    A foreign EXR may be larger by a whole factor: its pixels are averaged.
+    Either may be larger by a whole factor: its pixels are averaged, which with the box filter is the smaller image.
 
     Raises:
         ResultError: missing, broken, newer, or of another size.
@@ -473,10 +473,9 @@ def read_reference(path: Path, width: int, height: int) -> Reference:
         if name not in parts or not np.isfinite(parts[name]).all():
             raise ResultError(f"{path / 'reference.exr'} is broken: no finite part '{name}'; "
                               "remove the folder and make it again")
-        if parts[name].shape != (height, width, 3):
-            h, w, _ = parts[name].shape
-            raise ResultError(f"reference {path} is {w}x{h}, the experiment's image is {width}x{height}")
-    return Reference(parts["a.mean"], parts["b.mean"], parts["a.variance"], parts["b.variance"], meta)
+    averaged = parts["a.mean"].shape[1] // width                # pixels that become one, along a side
+    images = [_shrink(parts[name], width, height, path) for name in ("a.mean", "b.mean", "a.variance", "b.variance")]
+    return Reference(images[0], images[1], images[2] / averaged ** 2, images[3] / averaged ** 2, meta)
 
 
 def _shrink(image: np.ndarray, width: int, height: int, path: Path) -> np.ndarray:

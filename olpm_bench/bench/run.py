@@ -1,32 +1,20 @@
-"""One cell: warm up, train, render until the budget is spent; and an experiment: all its cells, resumable.
-
-What is on the clock: training and rendering, evaluated and synchronised.  What is not: compilation (every kernel is
-compiled before the clock starts, and what was missed is taken off and counted), accumulation, checkpoints, files,
-progress.  Charged seconds are defined in :mod:`olpm_bench.bench.clock`.
-"""
+"""An experiment: all its cells, resumable, methods interleaved; then its table and figures."""
 from __future__ import annotations
 
-import dataclasses
-import math
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from olpm_bench.bench import environment
-from olpm_bench.bench.clock import WAITED, Clock
-from olpm_bench.bench.config import CellSpec, Experiment
-from olpm_bench.bench.metrics import luminance
+from olpm_bench.bench.cell import CellFailedError, WarmUp, load_scene, measure, spp_of_pass, warm_up
+from olpm_bench.bench.clock import WAITED
+from olpm_bench.bench.config import CellSpec, Experiment, Scene
 from olpm_bench.bench.progress import Bar, is_interrupt, reason
 from olpm_bench.bench.results import (
-    Accumulator,
     Cell,
     LockedError,
     NewerSchemaError,
@@ -37,333 +25,9 @@ from olpm_bench.bench.results import (
     locked,
     read_reference,
 )
-from olpm_bench.scenes import load as scene_load
-from olpm_bench.transport.guide import Guide
-from olpm_bench.transport.training import PassStatistics, Training
 
-PASSES = 40                 # rendering passes in a budget, at least: so it is met within 1/40
-SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
-MAX_LANES = 2**24           # paths in flight: about 2 GB
-REPEATS = 3                 # timings of a pass in the warm-up: the shortest counts, a single one may be ten times as long
-WARM_UP_PATHS = 20_000      # photons and importons of the training that compiles the kernels
-
-HALF_LEARNT = 1500          # particles of a record with which its guide leaves twice the variance that it can come down to
+LARGER = 8                  # references are averaged down by whole factors up to this
 TRAINED = 0.5               # share of trained records below which a guide is reported: most paths are then unguided
-
-# 32-bit seeds of rendering passes: cells from 0, warm-up from 2^30, reference halves from 2^31 and 3 * 2^30.
-PASSES_PER_SEED = 2**15
-WARM_UP_SEED = 2**30
-
-
-class CellFailedError(RuntimeError):
-    """A cell that was run and cannot be used; the message is the reason."""
-
-
-def pass_seed(seed: int, index: int) -> int:
-    """Seed of rendering pass `index` of a cell: different for every (cell seed, pass), the same for every method."""
-    if index >= PASSES_PER_SEED:
-        raise CellFailedError(f"more than {PASSES_PER_SEED} passes; use a larger image or a smaller budget")
-    return seed * PASSES_PER_SEED + index
-
-
-# ---------------------------------------------------------------- kernels
-
-class Kernels:
-    """What Dr.Jit compiled since last asked."""
-
-    def __init__(self) -> None:
-        self.count, self.seconds = 0, 0.0
-
-    @staticmethod
-    @contextmanager
-    def watched() -> Iterator[Kernels]:
-        """Watch compilation while the body runs."""
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            yield Kernels()
-
-    def compiled(self) -> float:
-        """Seconds in the compiler since the last call; also adds to the totals."""
-        jit = [k for k in dr.kernel_history([dr.KernelType.JIT]) if not k["cache_hit"]]
-        seconds = sum(k["backend_time"] for k in jit) * 1e-3
-        self.count += len(jit)
-        self.seconds += seconds
-        return seconds
-
-
-def make_integrator(spec: CellSpec, guide: Guide | None) -> mi.Integrator:
-    from olpm_bench.transport.path import GuidedPathIntegrator  # whose base class exists once a variant is set
-
-    return GuidedPathIntegrator(spec.integrator, guide)
-
-
-def render_pass(scene: mi.Scene, integrator: mi.Integrator, seed: int, spp: int) -> mi.TensorXf:
-    """One pass, evaluated and finished (h, w, 3)."""
-    image = mi.render(scene, integrator=integrator, seed=seed, spp=spp)  # type: ignore[arg-type]
-    dr.eval(image)
-    dr.sync_thread()
-    return image
-
-
-def to_numpy(image: mi.TensorXf) -> np.ndarray:
-    return np.asarray(image.numpy(), dtype=np.float64)[..., :3]
-
-
-@dataclass(frozen=True)
-class WarmUp:
-    """What compiling a method's kernels on a scene told."""
-    compile_seconds: float
-    spp_seconds: float          # charged time of one sample a pixel, guided by the small training of the warm-up
-
-
-def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> WarmUp:
-    """Compile every kernel of a cell, with fewer particles: kernels depend on the structure and not on sizes."""
-    with Kernels.watched() as kernels:
-        if guide is None and spec.training is not None:
-            small = dataclasses.replace(spec.training, passes=min(spec.training.passes, 4),
-                                        photons=min(spec.training.photons, WARM_UP_PATHS),
-                                        importons=min(spec.training.importons, WARM_UP_PATHS),
-                                        camera_passes=min(spec.training.camera_passes, 4),
-                                        camera_paths=min(spec.training.camera_paths, WARM_UP_PATHS))
-            training = Training(scene, spec.method.representation or {}, small, spec.integrator, WARM_UP_SEED)
-            for _ in training.run():
-                pass
-            guide = training.radiance
-        integrator = make_integrator(spec, guide)
-        for spp in (1, 2):      # dividing by 1 is a kernel of its own
-            render_pass(scene, integrator, WARM_UP_SEED, spp)
-        kernels.compiled()
-        while True:
-            times = []
-            for _ in range(REPEATS):
-                clock = Clock(count_wait=environment.uses_llvm())
-                with clock.lap("render", kernels.compiled):
-                    render_pass(scene, integrator, WARM_UP_SEED, spp)
-                times.append(clock.charged)
-            if min(times) > SHORTEST_PASS / 4 or 4 * spp > largest_pass(spec):
-                return WarmUp(kernels.seconds, max(min(times), 1e-6) / spp)
-            spp *= 4
-
-
-def largest_pass(spec: CellSpec) -> int:
-    """Samples a pixel that a pass may take for the sake of memory."""
-    return max(1, MAX_LANES // (spec.scene.width * spec.scene.height))
-
-
-def spp_of_pass(spec: CellSpec, warm: WarmUp | None = None) -> int:
-    """Samples a pixel of each rendering pass: by timing for a budget in seconds, else by the experiment's file alone.
-
-    A power of two: Mitsuba divides the lane's index by it, and other divisors make other kernels.
-    """
-    if spec.budget.seconds is None:
-        spp = (spec.budget.spp or 0) / PASSES
-    else:
-        assert warm is not None
-        spp = max(SHORTEST_PASS, spec.budget.seconds / PASSES) / warm.spp_seconds
-    return power_of_two(min(spp, largest_pass(spec)))
-
-
-def power_of_two(n: float) -> int:
-    """The largest power of two <= n, at least 1."""
-    return 1 << max(0, int(n).bit_length() - 1)
-
-
-# ---------------------------------------------------------------- one cell
-
-@dataclass
-class Measurement:
-    """What a cell yields."""
-    info: dict[str, Any]
-    trace: list[dict[str, Any]]
-    image: dict[str, np.ndarray]
-    checkpoints: list[np.ndarray]
-    guide: Guide | None = field(repr=False, default=None)
-
-
-class _Cell:
-    """A cell in the making: its clock, the image so far, and what it writes down on the way."""
-
-    def __init__(self, spec: CellSpec, kernels: Kernels) -> None:
-        self.spec, self.kernels = spec, kernels
-        self.clock = Clock(count_wait=environment.uses_llvm())
-        self.image = Accumulator.empty(spec.scene.height, spec.scene.width)
-        self.brightness = Accumulator.empty(1, 1)
-        self.training: list[dict[str, Any]] = []
-        self.trace: list[dict[str, Any]] = []
-        self.checkpoints: list[np.ndarray] = []
-        self.targets: list[float] | None = None
-
-    @property
-    def spent(self) -> float:
-        """Share of the budget; the rule to stop does not look at the image."""
-        budget = self.spec.budget
-        return self.image.spp / budget.spp if budget.spp is not None else self.clock.charged / (budget.seconds or 1)
-
-    def train(self, training: Training) -> Iterator[PassStatistics]:
-        """Training passes, until all are done or their share of a budget in seconds is spent."""
-        settings, seconds = training.settings, self.spec.budget.seconds
-        passes, seen = training.run(), 0.0
-        while self.clock.charged < (end := end_of_training(settings.share, seconds, self.clock.charged, seen)):
-            late = self.clock.charged >= end / 2 if seconds is not None else 2 * len(self.training) >= training.passes
-            if (statistics := self._learn(lambda: next(passes, None), late and settings.blend)) is None:
-                break
-            seen = statistics.seen or seen
-            yield statistics
-
-    def has_room(self, spp: int) -> bool:
-        """Whether so many samples a pixel stay within a budget in samples."""
-        return self.spec.budget.spp is None or self.image.spp + spp <= self.spec.budget.spp
-
-    def render_and_learn(self, training: Training) -> None:
-        """A rendering pass from which the guide goes on learning; there must be room for it."""
-        self._learn(training.camera_pass, True)
-
-    def render(self, scene: mi.Scene, integrator: mi.Integrator, spp: int) -> None:
-        """A rendering pass of at most `spp` samples a pixel."""
-        left = self.spec.budget.spp - self.image.spp if self.spec.budget.spp is not None else spp
-        spp, seed = power_of_two(min(spp, left)), pass_seed(self.spec.seed, self.image.passes)
-        with self.clock.lap("render", self.kernels.compiled):
-            rendered = render_pass(scene, integrator, seed, spp)
-        self._add(rendered, spp, f"the pass with seed {seed}")
-
-    def _learn(self, learn: Callable[[], PassStatistics | None], enters: bool) -> PassStatistics | None:
-        """A training pass.  The time of tracing an image that enters the result is booked as rendering."""
-        before = self.clock["train"].charged
-        with self.clock.lap("train", self.kernels.compiled):
-            statistics = learn()
-            dr.sync_thread()
-        if statistics is None:
-            return None
-        self.training.append(statistics.as_dict())
-        if statistics.image is not None and enters and self.has_room(statistics.spp):
-            taken = self.clock["train"].charged
-            self.clock.move((taken - before) / max(taken, 1e-9) * statistics.share("trace"), "train", "render")
-            self._add(statistics.image, statistics.spp, f"training pass {statistics.index + 1}")
-        return statistics
-
-    def _add(self, rendered: mi.TensorXf, spp: int, source: str) -> None:
-        image = to_numpy(rendered)
-        check_pixels(image, source)
-        self.image.add(image, spp)
-        self.brightness.add(np.mean(luminance(image)), spp)
-
-    def checkpoint(self, guide: Guide | None) -> None:
-        """Keep the image, if it is time to."""
-        budget, total = self.spec.budget, self.clock.total
-        limit = float(budget.spp or budget.seconds or 0)
-        spent = self.spent * limit
-        if self.targets is None:
-            self.targets = checkpoint_times(spent, limit, budget.checkpoints)
-        if spent >= limit or spent >= self.targets[0]:
-            self.targets = [t for t in self.targets if t > spent]
-            self.trace.append({
-                "seconds": total.charged, "train_seconds": self.clock["train"].charged,
-                "render_seconds": self.clock["render"].charged, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
-                "spp": self.image.spp, "records": guide.records if guide else 0, "particles": guide.particles if guide else 0})
-            self.checkpoints.append(self.image.mean.astype(np.float32))
-
-
-def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None = None,
-            on_progress: Callable[[float, str], None] = lambda done, what: None) -> Measurement:
-    """Train, and render until the budget is spent.
-
-    Args:
-        warm: from :func:`warm_up` of this scene and method in this process.
-        guide: use it instead of training one.
-        on_progress: called off the clock with the share of the budget spent.
-
-    Raises:
-        CellFailedError: a pixel that is NaN, infinite or negative.
-    """
-    spp, training = spp_of_pass(spec, warm), None
-    with Kernels.watched() as kernels:
-        cell = _Cell(spec, kernels)
-        if guide is None and spec.training is not None:
-            training = Training(scene, spec.method.representation or {}, spec.training, spec.integrator, spec.seed)
-            guide = training.radiance
-            for statistics in cell.train(training):
-                if cell.image.passes:
-                    cell.checkpoint(guide)
-                on_progress(min(1.0, cell.spent), f"training pass {statistics.index + 1} of {statistics.passes} at most")
-        integrator = make_integrator(spec, guide)
-        while cell.spent < 1 or cell.image.passes == 0:
-            if training is not None and training.settings.while_rendering and cell.has_room(training.camera_spp):
-                cell.render_and_learn(training)
-            else:
-                cell.render(scene, integrator, spp)
-            cell.checkpoint(guide)
-            on_progress(min(1.0, cell.spent), f"{cell.image.spp} spp")
-
-    clock, total, image = cell.clock, cell.clock.total, cell.image
-    info = {
-        "key": spec.key, "spp": image.spp, "charged_seconds": total.charged, "train_seconds": clock["train"].charged,
-        "render_seconds": clock["render"].charged, "compile_seconds": warm.compile_seconds + kernels.seconds,
-        "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
-        "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
-        "trained": guide.trained if guide is not None else None, "training_passes": len(cell.training),
-        "warnings": list(dict.fromkeys(w for p in cell.training for w in p["warnings"])),
-        "records": guide.records if guide is not None else 0, "particles": guide.particles if guide is not None else 0,
-        "bytes_per_record": guide.bytes_per_record if guide is not None else 0, "invalid_pixels": 0,
-        "mean": float(cell.brightness.mean[0, 0, 0]), "mean_stderr": math.sqrt(float(cell.brightness.variance()[0, 0, 0])),
-        "pass_spp": spp, "passes": cell.training,
-    }
-    h, w, _ = image.mean.shape
-    layers = {"mean": image.mean, "variance": image.variance(), "count": np.full((h, w), image.spp, np.float32)}
-    return Measurement(info, cell.trace, {k: v.astype(np.float32) for k, v in layers.items()}, cell.checkpoints, guide)
-
-
-def end_of_training(share: float | Literal["auto"], seconds: float | None, spent: float, seen: float) -> float:
-    """Charged seconds at which training ends; never, for a budget in samples.
-
-    For "auto", records that have seen n particles are taken to guide with a variance V ~ 1 + HALF_LEARNT / n.  With n in
-    proportion to the time t of training that is 1 + X / t, and V / (T - t) is least at  t = sqrt(X^2 + X T) - X:  half of a short
-    budget T, about sqrt(X T) of a long one.  Neither the rule nor what it is told looks at the image.
-
-    Args:
-        share: as in `TrainingSettings`; seconds: the budget.
-        spent: charged seconds of training so far.
-        seen: particles that the records on the camera's paths have seen by then, on average; 0: not known.
-    """
-    if seconds is None:
-        return math.inf
-    if share != "auto":
-        return share * seconds
-    if seen == 0:
-        return seconds / 2
-    X = spent * HALF_LEARNT / seen
-    return math.sqrt(X * X + X * seconds) - X
-
-
-def checkpoint_times(first: float, last: float, n: int) -> list[float]:
-    """Log-spaced times (or sample counts) from the first pass to the end of the budget."""
-    return [float(t) for t in np.geomspace(min(max(first, 1e-3 * last), last), last, n)] if n > 1 else [last]
-
-
-def check_pixels(image: np.ndarray, source: str) -> None:
-    """
-    Args:
-        source: of the image, for the message.
-
-    Raises:
-        CellFailedError: a pixel is NaN, infinite or negative.
-    """
-    invalid = ~(np.isfinite(image) & (image >= 0)).all(axis=-1)
-    if invalid.any():
-        y, x = np.argwhere(invalid)[0]
-        raise CellFailedError(f"{int(invalid.sum())} pixels are NaN, infinite or negative; the first is "
-                              f"x = {x}, y = {y}: {image[y, x].tolist()}, in {source}")
-
-
-# ---------------------------------------------------------------- an experiment
-
-def load_scene(spec: CellSpec) -> mi.Scene:
-    """The scene of a cell.
-
-    Raises:
-        SceneError: it cannot be used.
-    """
-    s = spec.scene
-    return scene_load.load(s.file or s.name, s.arguments, s.width, s.height, spec.integrator.max_depth)
 
 
 def references(experiment: Experiment, root: Path) -> dict[str, Reference]:
@@ -377,13 +41,21 @@ def references(experiment: Experiment, root: Path) -> dict[str, Reference]:
     """
     found = {}
     for scene in (scene for scene in experiment.scene if scene.has_reference):
-        key = experiment.reference_key(scene)
-        path = scene.reference or find_reference(key, reference_folders(experiment, root))
+        path = scene.reference or _reference(experiment, scene, root)
         if path is None:
-            raise ResultError(f"scene {scene.name} has no reference {key}; make it with: "
-                              f"olpm-bench reference {shlex.quote(str(experiment.path))}, or do without: reference = \"none\"")
+            raise ResultError(f"scene {scene.name} has no reference {experiment.reference_key(scene)}; make it with: "
+                              f"{shlex.join(experiment.command('reference'))}, or do without: reference = \"none\"")
         found[scene.name] = read_reference(path, scene.width, scene.height)
     return found
+
+
+def _reference(experiment: Experiment, scene: Scene, root: Path) -> Path | None:
+    """The scene's reference of this size, or of a multiple of it: that of the full scale serves a small one."""
+    for factor in range(1, LARGER + 1):
+        larger = scene.model_copy(update={"width": factor * scene.width, "height": factor * scene.height})
+        if found := find_reference(experiment.reference_key(larger), reference_folders(experiment, root)):
+            return found
+    return None
 
 
 def reference_folders(experiment: Experiment, root: Path) -> list[Path]:
@@ -402,7 +74,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> list[st
         ResultError: a reference is missing (nothing was run), or a result is of a newer schema.
         SceneError, OSError: a scene cannot be used; a file cannot be written.
     """
-    results, part = Results(root / experiment.path.stem), experiment.of_scenes(only)
+    results, part = Results(root / experiment.stem), experiment.of_scenes(only)
     references(part, root)                                  # before hours of work, not after
     cells = part.cells()
     loaded = {spec.scene.name: load_scene(spec) for spec in {c.scene.name: c for c in cells}.values()}
@@ -482,7 +154,7 @@ def _run_cell(results: Results, spec: CellSpec, scene: mi.Scene, warm: dict[tupl
 
 def plan(experiment: Experiment, root: Path) -> dict[str, Any]:
     """What a run would do: cells, those to run, hours (None for a budget of samples), gigabytes of memory."""
-    results = Results(root / experiment.path.stem)
+    results = Results(root / experiment.stem)
     cells = experiment.cells()
     todo = [spec for spec in cells if not is_complete(results, spec)[0]]
     seconds = [spec.budget.seconds for spec in todo]
@@ -511,9 +183,9 @@ def report(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> None
         ResultError: a cell or a reference is missing.
     """
     from olpm_bench.bench import summary
-    from olpm_bench.report import figures, sheet
+    from olpm_bench.report import figures, sheet, sweeps
 
-    results = Results(root / experiment.path.stem)
+    results = Results(root / experiment.stem)
     missing = Counter(spec.scene.name for spec in experiment.cells() if not is_complete(results, spec)[0]) if only else Counter()
     if missing:
         experiment = experiment.of_scenes(only)
@@ -530,6 +202,8 @@ def report(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> None
     summary.write(summarised, results)
     if figures.gains(results, experiment, summarised):
         written += ["gains.png", "gains.pdf"]
+    if sweeps.sweeps(results, experiment, found):
+        written += ["sweep.png", "sweep.pdf"]
     if found:
         figures.curves(results, experiment, found)
         sheet.sheet(results, experiment, found)

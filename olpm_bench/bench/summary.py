@@ -63,7 +63,7 @@ def scene_reference(references: Mapping[str, Reference], scene: Scene, results: 
 
 
 def _command(name: str, experiment: Experiment, results: Results) -> str:
-    return shlex.join(["olpm-bench", name, str(experiment.path), "--results", str(results.folder.parent)])
+    return shlex.join([*experiment.command(name), "--results", str(results.folder.parent)])
 
 
 def error_curve(cells: Sequence[Cell], reference: Reference,

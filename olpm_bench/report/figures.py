@@ -7,16 +7,16 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from olpm_bench.bench import statistics, summary
-from olpm_bench.bench.results import Reference, Results, read_json, replacing
+from olpm_bench.bench.results import Cell, Reference, Results, read_json, replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 
 STYLE = Path(__file__).with_name("olpm_bench.mplstyle")
 GREY = "#8a8a8a"
+TIMES = "\N{MULTIPLICATION SIGN}"
 PLAIN: dict[str, Any] = {"marker": "none", "linestyle": "-"}
 NEAR_FLOOR = 2.0                # errors below this many noise floors are the reference's own: drawn faintly
+NEAR_LABEL = 0.8                # curves that end further left, in axes units, are not tied to their labels
 PANEL = (2.75, 2.05)            # width, height of a panel's axes [inch]
 COLUMNS = 2                     # panels side by side
 ROW = 0.17                      # height of a row of gains [inch]
@@ -39,48 +41,64 @@ class Panel:
 
     curves: method -> error of every seed over the abscissa.
     training: method -> where its training ends on the abscissa; methods without training are left out.
-    budget: where the cells were to stop.
+    budget: where the cells were to stop, None if that is elsewhere for each.
     floor: noise floor of the reference, mean |A - B| / 2; 0 if unknown.
+    speed_ups: method -> how much faster than the baseline it is at equal error.
+    abscissa, ordinate: labels of the axes; numbers: of the ticks of the abscissa.
+    slope: show the rate of Monte Carlo.
+    looks: names in the order of colours, markers and dashes, where panels have not the same curves.
     """
     title: str
     curves: dict[str, statistics.Curve]
     training: dict[str, float]
-    budget: float
+    budget: float | None
     floor: float
+    speed_ups: dict[str, statistics.Interval] = field(default_factory=dict)
+    abscissa: str = "time [s], training included"
+    ordinate: str = "L1 error"
+    numbers: Callable[[float], str] | None = None       # `tick_label`
+    slope: bool = True
+    looks: tuple[str, ...] = ()
 
 
 def curves(results: Results, experiment: Experiment, references: Mapping[str, Reference],
            out: Path | None = None) -> None:
     """Write figure.png and figure.pdf into `out` (the results folder by default).
 
-    A budget in samples puts samples per pixel on the abscissa, one in seconds charged seconds.  Scenes without reference are
-    left out; there must be another.
+    A panel a scene over charged seconds, and for a budget in samples another over samples per pixel.  Scenes without reference
+    are left out; there must be another.
 
     Raises:
         ResultError: a cell or reference is missing; the message names the command that makes it.
     """
-    over = "seconds" if experiment.budget.spp is None else "spp"
+    axes = ["seconds"] if experiment.budget.spp is None else ["spp", "seconds"]
     cells = summary.complete_cells(experiment, results)
     panels = []
     for scene in experiment.scene:
         reference = summary.scene_reference(references, scene, results, experiment)
         if reference is None:
             continue
-        methods = {method.name: cells[scene.name, method.name] for method in experiment.method}
-        trained = {method: float(np.median([cell.trace[0]["train_seconds"] for cell in group]))
-                   for method, group in methods.items()}
-        panels.append(Panel(
-            title=scene.name if len(experiment.scene) > 1 else experiment.title,
-            curves={method: summary.error_curve(group, reference, over=over) for method, group in methods.items()},
-            training={method: t for method, t in trained.items() if t > 0} if over == "seconds" else {},
-            budget=experiment.budget.seconds or experiment.budget.spp or 0,
-            floor=reference.noise_floor or 0.0))
+        methods = {method.name: cells[scene.name, method.name] for method in experiment.shown}
+        title = scene.name if len(experiment.scene) * len(axes) > 1 else experiment.title
+        panels += [_panel(title, methods, reference, over, experiment) for over in axes]
     faint = any((curve.median < NEAR_FLOOR * panel.floor).any() for panel in panels for curve in panel.curves.values())
     note = caption(experiment, read_json(results.folder / "env.json"), faint)
     with style():
-        figure = draw(panels, "time [s], training included" if over == "seconds" else "samples per pixel",
-                      experiment.title if len(panels) > 1 else "", note)
+        figure = draw(panels, experiment.title if len(panels) > 1 else "", note)
         save(figure, out or results.folder, "figure")
+
+
+def _panel(title: str, methods: Mapping[str, Sequence[Cell]], reference: Reference, over: str, experiment: Experiment) -> Panel:
+    found = {method: summary.error_curve(cells, reference, over=over) for method, cells in methods.items()}
+    floor = reference.noise_floor or 0.0
+    if over == "spp":
+        return Panel(title, found, {}, float(experiment.budget.spp or 0), floor, abscissa="samples per pixel")
+    trained = {method: float(np.median([cell.trace[0]["train_seconds"] for cell in cells])) for method, cells in methods.items()}
+    baseline = found.get(experiment.baseline_name)
+    return Panel(title, found, {method: t for method, t in trained.items() if t > 0},
+                 experiment.budget.seconds, floor,
+                 {method: statistics.speed_up(baseline, curve) for method, curve in found.items()
+                  if baseline is not None and curve is not baseline})
 
 
 def gains(results: Results, experiment: Experiment, summarised: Mapping[str, Any], out: Path | None = None) -> bool:
@@ -191,9 +209,10 @@ def caption(experiment: Experiment, environment: Mapping[str, Any], faint: bool 
     """
     n = len(experiment.seeds)
     seeds = f"Median and 5\N{EN DASH}95 % band of {n} seeds." if n > 1 else "One seed."
-    training = " Time includes training; triangles mark its end." if experiment.budget.spp is None else ""
+    faster = f" {TIMES}: times as fast as {experiment.baseline_name} to an equal error, 90 % interval."
     near = f" Faint: below {NEAR_FLOOR:g} times the noise of the reference." if faint else ""
-    return f"{seeds}{training}{near} {machine(environment)}"
+    times = f" Triangles mark the end of training.{faster if len(experiment.shown) > 1 else ''}"
+    return f"{seeds}{times}{near} {machine(environment)}"
 
 
 def machine(environment: Mapping[str, Any]) -> str:
@@ -201,11 +220,11 @@ def machine(environment: Mapping[str, Any]) -> str:
     return f"{environment['cpu']}, {environment['threads']} threads."
 
 
-def draw(panels: Sequence[Panel], abscissa: str, title: str = "", note: str = "") -> Figure:
+def draw(panels: Sequence[Panel], title: str = "", note: str = "") -> Figure:
     """The figure, in the style that is active.
 
     Args:
-        abscissa: label of the x axis; title: above all panels; note: caption below them.
+        title: above all panels; note: caption below them.
     """
     from matplotlib.figure import Figure
 
@@ -213,13 +232,14 @@ def draw(panels: Sequence[Panel], abscissa: str, title: str = "", note: str = ""
     subplots = [figure.add_axes((0, 0, 1, 1), label=str(i)) for i in range(len(panels))]
     for axes, panel in zip(subplots, panels, strict=True):
         _draw_panel(axes, panel)
-        axes.set_xlabel(abscissa)
+        axes.set_xlabel(panel.abscissa)
     columns = min(COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
     numbers = [label.get_text() for axes in subplots for label in axes.get_yticklabels()]
     left = 0.32 + max(_text_width(text, 7.5) for text in numbers)
-    right = 0.28 + 1.03 * max(_text_width(method, 8) for panel in panels for method in panel.curves)
-    bottom, top = 0.42, 0.28
+    right = 0.28 + 1.03 * max(_text_width(text, size) for panel in panels for text, size in (
+        *((method, 8) for method in panel.curves), *((speed_up_label(interval), 6.5) for interval in panel.speed_ups.values())))
+    bottom, top = 0.42, 0.28 if any(panel.title for panel in panels) else 0.1
     width = columns * (left + PANEL[0] + right)
     lines = textwrap.wrap(note, width=int((width - left) * 21))
     head, foot = 0.28 if title else 0.0, 0.06 + 0.115 * len(lines)
@@ -230,8 +250,8 @@ def draw(panels: Sequence[Panel], abscissa: str, title: str = "", note: str = ""
         x = left + column * (left + PANEL[0] + right)
         y = height - head - row * (top + PANEL[1] + bottom) - top - PANEL[1]
         axes.set_position((x / width, y / height, PANEL[0] / width, PANEL[1] / height))
-        if column == 0:
-            axes.set_ylabel("L1 error")
+        if column == 0 or panels[i].ordinate != panels[i - 1].ordinate:
+            axes.set_ylabel(panels[i].ordinate)
             axes.yaxis.set_label_coords(-(left - 0.18) / PANEL[0], 0.5)
     if title:
         figure.text(0.5, 1 - 0.08 / height, title, ha="center", va="top", fontsize=10.5)
@@ -240,8 +260,18 @@ def draw(panels: Sequence[Panel], abscissa: str, title: str = "", note: str = ""
     return figure
 
 
+def speed_up_label(interval: statistics.Interval) -> str:
+    """A speed-up, with its interval where there is one; empty where two curves share no error."""
+    if not math.isfinite(interval.value):
+        return ""
+    spread = f" ({interval.low:.2g}\N{EN DASH}{interval.high:.2g})" if math.isfinite(interval.low) and not interval.bound else ""
+    return f"{interval.bound}{interval.value:.2g}{TIMES}{spread}"
+
+
 def _text_width(text: str, size: float) -> float:
     """Width [inch] of a text of `size` points."""
+    if not text:
+        return 0.0
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
@@ -251,7 +281,8 @@ def _text_width(text: str, size: float) -> float:
 def _draw_panel(axes: Axes, panel: Panel) -> None:
     from matplotlib import rcParams
 
-    styles = dict(zip(panel.curves, rcParams["axes.prop_cycle"](), strict=False))
+    looks = dict(zip(panel.looks or panel.curves, rcParams["axes.prop_cycle"](), strict=False))
+    styles = {method: looks[method] for method in panel.curves}
     axes.set_title(panel.title)
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -259,16 +290,17 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     for method, curve in panel.curves.items():
         _draw_curve(axes, curve, styles[method], panel.floor)
     _draw_floor(axes, panel)
-    _draw_slope(axes, panel)
+    if panel.slope:
+        _draw_slope(axes, panel)
     _draw_training(axes, panel.training, styles)
-    _draw_labels(axes, panel.curves, styles)
+    _draw_labels(axes, panel, styles)
 
 
 def _limits(axes: Axes, panel: Panel) -> None:
     """Axes that hold curves, training and, where it isn't far below, the noise floor; with ticks at round numbers."""
     bands = [statistics.median_band(curve.errors) for curve in panel.curves.values()]
     starts = [curve.times[0] for curve in panel.curves.values()] + list(panel.training.values())
-    x_low, x_high = min(starts), max(panel.budget, *(curve.times[-1] for curve in panel.curves.values()))
+    x_low, x_high = min(starts), max(panel.budget or 0, *(curve.times[-1] for curve in panel.curves.values()))
     y_low, y_high = min(band.low.min() for band in bands), max(band.high.max() for band in bands)
     if panel.floor > y_low / 4:
         y_low = min(y_low, panel.floor)
@@ -276,8 +308,9 @@ def _limits(axes: Axes, panel: Panel) -> None:
     y_low, y_high = _padded(y_low, y_high, 0.1)
     axes.set_xlim(x_low, x_high)
     axes.set_ylim(y_low, y_high)
-    for axis, positions in ((axes.xaxis, ticks(x_low, x_high, panel.budget)), (axes.yaxis, ticks(y_low, y_high))):
-        axis.set_ticks(positions, [tick_label(position) for position in positions])
+    for axis, positions, label in ((axes.xaxis, ticks(x_low, x_high, panel.budget), panel.numbers or tick_label),
+                                   (axes.yaxis, ticks(y_low, y_high), tick_label)):
+        axis.set_ticks(positions, [label(position) for position in positions])
         axis.set_ticks([], minor=True)
 
 
@@ -292,7 +325,7 @@ def _padded(low: float, high: float, share: float) -> tuple[float, float]:
 def ticks(low: float, high: float, end: float | None = None) -> list[float]:
     """Round numbers from `low` to `high` for a logarithmic axis, at least three; and `end`, in place of near ones."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    for ladder in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), np.arange(1, 10, 0.5), np.arange(1, 10, 0.2)):
+    for ladder in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), range(1, 10), np.arange(1, 10, 0.5), np.arange(1, 10, 0.2)):
         found = [float(f"{m:g}e{d}") for d in decades for m in ladder if low <= float(f"{m:g}e{d}") <= high]
         if len(found) >= 3:
             break
@@ -358,16 +391,20 @@ def _draw_training(axes: Axes, training: Mapping[str, float], styles: Mapping[st
                   transform=axes.transAxes, clip_on=False, zorder=5)
 
 
-def _draw_labels(axes: Axes, curves: Mapping[str, statistics.Curve], styles: Mapping[str, Mapping[str, Any]]) -> None:
-    """Method names at the ends of their curves, moved apart where they would overlap."""
+def _draw_labels(axes: Axes, panel: Panel, styles: Mapping[str, Mapping[str, Any]]) -> None:
+    """Method names, with their speed-ups below, at the ends of their curves, moved apart where they would overlap."""
     points = [axes.transAxes.inverted().transform(axes.transData.transform((curve.times[-1], curve.median[-1])))
-              for curve in curves.values()]
-    heights = spread([float(y) for _, y in points], gap=10 / 72 / PANEL[1])
+              for curve in panel.curves.values()]
+    heights = spread([float(y) for _, y in points], gap=(17 if panel.speed_ups else 10) / 72 / PANEL[1])
     for (method, style), (x, y), label_y in zip(styles.items(), points, heights, strict=False):
-        axes.plot([x, 1.02, 1.035], [y, label_y, label_y], **{**style, **PLAIN}, linewidth=0.6, alpha=0.7,
-                  transform=axes.transAxes, clip_on=False, zorder=1)
+        if x > NEAR_LABEL:
+            axes.plot([x, 1.02, 1.035], [y, label_y, label_y], **{**style, **PLAIN}, linewidth=0.6, alpha=0.7,
+                      transform=axes.transAxes, clip_on=False, zorder=1)
         axes.plot(1.05, label_y, **style, transform=axes.transAxes, clip_on=False)
         axes.text(1.07, label_y, method, color=style["color"], transform=axes.transAxes, va="center_baseline")
+        if method in panel.speed_ups:
+            axes.text(1.07, label_y - 7.5 / 72 / PANEL[1], speed_up_label(panel.speed_ups[method]), fontsize=6.5, color=GREY,
+                      transform=axes.transAxes, va="center_baseline")
 
 
 def spread(positions: Sequence[float], gap: float) -> list[float]:

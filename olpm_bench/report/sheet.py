@@ -54,7 +54,7 @@ def sheet(results: Results, experiment: Experiment, references: Mapping[str, Ref
         if reference is None:
             continue
         images = {}
-        for method in (method.name for method in experiment.method):
+        for method in (method.name for method in experiment.shown):
             images[method] = _median_image([cell.image()["mean"] for cell in cells[scene.name, method]], reference.mean)
         blocks.append(Block(scene.name, reference.mean, reference.noise_floor, images))
     note = _caption(experiment, read_json(results.folder / "env.json"))

@@ -137,6 +137,16 @@ def test_dry_run_runs_nothing(experiment, tmp_path):
     assert result.stdout.count("seed") == 4 and not (tmp_path / "results" / "test").exists()
 
 
+def test_a_scale_is_run_and_named_in_commands_to_come(experiment, tmp_path):
+    experiment.write_text(TOML + "[scale.small]\nseeds = 1\nscene = { width = 5, height = 4 }\n")
+    results = tmp_path / "results"
+    run = ("run", experiment, "--results", results, "--scale")
+    assert "2 of 2 cells to run" in call(*run, "small", "--dry-run").stdout
+    assert complaint(call(*run, "large")) == "olpm-bench: --scale large: test.toml has no [scale.large]; known: small"
+    assert "test.toml --scale small, or do without" in complaint(call(*run, "small"))     # 5 does not divide 48
+    assert not (results / "test-small").exists()
+
+
 def test_a_failed_cell_exits_with_1(experiment, tmp_path, monkeypatch):
     from olpm_bench.bench import run
 
@@ -327,7 +337,8 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
     ("fit", "--representation", "cosine", "--samples", "s.npz", "--heldout", "h.npz")])
 def test_an_error_of_mitsuba_is_one_line_and_exit_code_1(tmp_path, monkeypatch, arguments):
     """Also with the cause that Dr.Jit keeps to itself, and from `reason` alike in a cell of `run`."""
-    from olpm_bench.bench import fit, run
+    from olpm_bench.bench import fit
+    from olpm_bench.scenes import load
 
     def fail(*args, **kwargs):
         try:
@@ -335,7 +346,7 @@ def test_an_error_of_mitsuba_is_one_line_and_exit_code_1(tmp_path, monkeypatch, 
         except TypeError as error:
             raise RuntimeError("dr.while_loop(): encountered\n  an exception") from error
 
-    monkeypatch.setattr(run, "load_scene", fail)
+    monkeypatch.setattr(load, "load", fail)
     monkeypatch.setattr(fit, "fit", fail)
     monkeypatch.chdir(tmp_path)
     Path("good.toml").write_text(TOML)

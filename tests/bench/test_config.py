@@ -1,7 +1,6 @@
 """Experiment files: what is read, what is refused and with which words, and what determines a cell."""
 from __future__ import annotations
 
-import dataclasses
 import tomllib
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 
 from olpm_bench.bench import config
 from olpm_bench.bench.config import ConfigError
-from olpm_bench.transport import settings
 
 MINIMAL = """
 title = "Test"
@@ -220,36 +218,11 @@ def test_the_key_follows_our_own_code_and_the_reference_does_not(tmp_path, monke
     assert before.reference_key(before.scene[0]) == after.reference_key(after.scene[0])
 
 
-def test_the_committed_reference_keeps_its_key():
-    quickstart = config.load(Path(__file__).resolve().parents[2] / "experiments" / "quickstart.toml")
-    assert quickstart.reference_key(quickstart.scene[0]) == "door_ajar-96x54-075c0ded"
-
-
-def of_this_project(tmp_path: Path, name: str) -> config.Experiment:
-    """An experiment of ours, with an empty scene in the place of other people's."""
-    (tmp_path / "room.xml").write_text(XML)
-    file = Path(__file__).resolve().parents[2] / "experiments" / name
-    scenes = [scene["name"] for scene in tomllib.loads(file.read_text())["scene"] if "file" in scene]
-    return config.load(file, dict.fromkeys(scenes, tmp_path / "room.xml"))
-
-
-def test_the_ablation_leaves_out_one_addition_at_a_time(tmp_path):
-    experiment = of_this_project(tmp_path, "ablation.toml")
-    best, *others = ({**dataclasses.asdict(c.integrator), **dataclasses.asdict(c.training)} for c in
-                     experiment.cells()[:len(experiment.method)])
-    assert experiment.baseline_name == experiment.method[0].name == "best" and len(experiment.seeds) >= 8
-    for other in others:
-        assert sum(other[key] != best[key] for key in best) == 1
-
-
-def test_the_targets_compare_presets_with_plain_path_tracing(tmp_path):
-    experiment = of_this_project(tmp_path, "targets.toml")
-    scene, names = experiment.scene[0], [method.name for method in experiment.method]
-    assert experiment.baseline_name == "Path tracing" and experiment.method[0].representation is None
-    for name, method in zip(names[1:], experiment.method[1:], strict=True):
-        preset = name.removeprefix("GMM ")
-        assert experiment.training_of(method) == settings.training(preset)
-        assert experiment.integrator_of(scene, method) == settings.integrator(preset)
+@pytest.mark.parametrize("name", ["cell.py", "path.py", "jensen.py"])
+def test_our_own_code_is_that_of_cells_transport_and_representations(monkeypatch, name):
+    before, read = config.own_code(), Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda file, **k: read(file, **k) + "#" * (file.name == name))
+    assert config.own_code.__wrapped__() != before
 
 
 def test_a_missing_file_and_one_that_is_no_text(tmp_path):

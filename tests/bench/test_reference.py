@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from olpm_bench.bench import config, reference, run
+from olpm_bench.bench import cell, config, reference
 from olpm_bench.bench.results import LockedError, ResultError, locked, read_reference
 
 TOML = """
@@ -27,7 +27,7 @@ name = "Path tracing"
 @pytest.fixture
 def experiment(tmp_path, monkeypatch):
     """Passes are of 4 samples and the clock says half a second each, whatever the machine."""
-    class Ticks(run.Clock):
+    class Ticks(cell.Clock):
         charged = 0.0
 
         def lap(self, *args):
@@ -68,7 +68,7 @@ def test_halves_agree_within_their_errors(experiment, tmp_path):
 
 
 def test_an_interruption_keeps_what_is_there(experiment, tmp_path, monkeypatch):
-    render, calls = run.render_pass, []
+    render, calls = cell.render_pass, []
 
     def interrupted(*args):
         calls.append(args)
@@ -76,7 +76,7 @@ def test_an_interruption_keeps_what_is_there(experiment, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return render(*args)
 
-    monkeypatch.setattr(run, "render_pass", interrupted)
+    monkeypatch.setattr(cell, "render_pass", interrupted)
     with pytest.raises(KeyboardInterrupt):
         reference.improve(experiment, tmp_path, seconds=60)
     folder = tmp_path / "references" / experiment.reference_key(experiment.scene[0])

@@ -21,12 +21,14 @@ TIMES = np.geomspace(1, 16, 9)
 def panel(levels: dict[str, float], floor: float = 0.0, budget: float = 16) -> figures.Panel:
     curves = {name: statistics.common_curve([TIMES] * 3, [level * k / np.sqrt(TIMES) for k in (0.9, 1, 1.2)])
               for name, level in levels.items()}
-    return figures.Panel("scene", curves, dict.fromkeys(list(levels)[1:], 1.5), budget, floor)
+    others = list(levels)[1:]
+    return figures.Panel("scene", curves, dict.fromkeys(others, 1.5), budget, floor,
+                         dict.fromkeys(others, statistics.Interval(12.3, 10.4, 15.1)))
 
 
 def drawn(*panels: figures.Panel) -> matplotlib.figure.Figure:
     with figures.style():
-        figure = figures.draw(panels, "time [s], training included", "Title", "Note.")
+        figure = figures.draw(panels, "Title", "Note.")
         figure.set_dpi(matplotlib.rcParams["savefig.dpi"])
         FigureCanvasAgg(figure).draw()
     return figure
@@ -55,14 +57,14 @@ def test_methods_differ_in_colour_and_in_marker_and_in_dash():
     with figures.style():
         styles = list(matplotlib.rcParams["axes.prop_cycle"])
     for key in ("color", "marker", "linestyle"):
-        assert len({str(style[key]) for style in styles}) == len(styles) >= 8
+        assert len({str(style[key]) for style in styles}) == len(styles) == config.LOOKS
 
 
 def test_a_panel_shows_medians_band_floor_slope_and_training():
     figure = drawn(panel({"Path tracing": 1.0, "GMM": 0.5}, floor=0.05))
     axes = figure.axes[0]
-    assert {"Path tracing", "GMM", "noise of the reference", "slope \N{MINUS SIGN}1/2"} <= {
-        text.get_text() for text in visible_texts(figure)}
+    assert {"Path tracing", "GMM", "noise of the reference", "slope \N{MINUS SIGN}1/2",
+            "12\N{MULTIPLICATION SIGN} (10\N{EN DASH}15)"} <= {text.get_text() for text in visible_texts(figure)}
     assert len(axes.collections) == 2                                   # bands
     solid = [line for line in axes.lines if line.get_transform() == axes.transData and len(line.get_xdata()) > 9]
     np.testing.assert_allclose(solid[0].get_ydata(), 1 / np.sqrt(solid[0].get_xdata()))
@@ -76,6 +78,30 @@ def test_a_panel_shows_medians_band_floor_slope_and_training():
     assert x == pytest.approx(1.5)
 
 
+@pytest.mark.parametrize("interval, text", [
+    (statistics.Interval(2.0, 1.5, 2.5), "2\N{MULTIPLICATION SIGN} (1.5\N{EN DASH}2.5)"),
+    (statistics.Interval(2.0, np.nan, np.nan), "2\N{MULTIPLICATION SIGN}"),
+    (statistics.Interval(3.0, 2.0, 4.0, ">"), ">3\N{MULTIPLICATION SIGN}"), (statistics.Interval(np.nan, np.nan, np.nan), "")])
+def test_speed_ups_are_short(interval, text):
+    assert figures.speed_up_label(interval) == text
+
+
+def test_equal_samples_are_shown_beside_equal_time(finished, monkeypatch):
+    panels = []
+    monkeypatch.setattr(figures, "draw", lambda drawn, *_: panels.extend(drawn) or matplotlib.figure.Figure())
+    figures.curves(finished.results, finished.experiment, finished.references)
+    samples = finished.experiment.model_copy(update={"budget": config.Budget(spp=160, checkpoints=5)})
+    monkeypatch.setattr(summary, "complete_cells", lambda *_: CELLS)
+    CELLS = {("door_ajar", m.name): [finished.results.read_cell("door_ajar", m.name, s) for s in range(3)]
+             for m in finished.experiment.method}
+    figures.curves(finished.results, samples, finished.references)
+    alone, spp, seconds = panels
+    assert [p.abscissa for p in panels] == ["time [s], training included", "samples per pixel", "time [s], training included"]
+    assert (spp.budget, spp.training, spp.speed_ups) == (160, {}, {}) and seconds.training == alone.training
+    assert list(alone.speed_ups) == ["Quick & dirty"] and alone.speed_ups["Quick & dirty"].value == pytest.approx(6.25, rel=0.2)
+    assert seconds.speed_ups == alone.speed_ups and (alone.budget, seconds.budget) == (16, None)
+
+
 def test_curves_near_the_noise_of_the_reference_are_faint():
     axes = drawn(panel({"A": 1.0}, floor=0.25)).axes[0]
     clear = next(line for line in axes.lines if np.isnan(line.get_ydata()).any())
@@ -84,7 +110,7 @@ def test_curves_near_the_noise_of_the_reference_are_faint():
 
 @pytest.mark.parametrize(("low", "high", "end", "expected"), [
     (0.6, 15.5, 15, [1, 2, 5, 10, 15]), (0.6, 60, 60, [1, 10, 60]), (9, 16, 15, [10, 15]),
-    (0.01, 0.3, None, [0.01, 0.02, 0.05, 0.1, 0.2])])
+    (0.01, 0.3, None, [0.01, 0.02, 0.05, 0.1, 0.2]), (0.52, 1.03, None, [0.6, 0.7, 0.8, 0.9, 1])])
 def test_ticks_are_few_and_round(low, high, end, expected):
     found = figures.ticks(low, high, end)
     assert set(expected) <= set(found) and len(found) <= 7 and found == sorted(found)
@@ -107,8 +133,8 @@ def test_from_a_results_folder(finished):
     assert imread(finished.results.folder / "figure.png").std() > 10
     assert (finished.results.folder / "figure.pdf").read_bytes().startswith(b"%PDF")
     note = figures.caption(finished.experiment, {"cpu": "Abacus 2", "threads": 2})
-    assert note == ("Median and 5\N{EN DASH}95 % band of 3 seeds. Time includes training; triangles mark its end. "
-                    "Abacus 2, 2 threads.")
+    assert note == ("Median and 5\N{EN DASH}95 % band of 3 seeds. Triangles mark the end of training. \N{MULTIPLICATION SIGN}: "
+                    "times as fast as Path tracing to an equal error, 90 % interval. Abacus 2, 2 threads.")
 
 
 def gain_rows(methods: list[str], scenes: list[str]) -> list[dict]:

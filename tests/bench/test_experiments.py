@@ -1,0 +1,108 @@
+"""The experiments of this project: each can be loaded at each of its scales, and is what it says."""
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from olpm_bench.bench import config, run
+from olpm_bench.transport import settings
+
+FOLDER = Path(__file__).resolve().parents[2] / "experiments"
+FILES = {file.name: tomllib.loads(file.read_text()) for file in sorted(FOLDER.glob("*.toml"))}
+SMALL_SECONDS = 150         # charged seconds of all cells of a small scale: with compilation about three minutes
+
+
+def of_this_project(tmp_path: Path, name: str, scale: str | None = None) -> config.Experiment:
+    """An experiment of ours, with an empty scene in the place of other people's."""
+    (tmp_path / "room.xml").write_text('<scene version="3.0.0"/>')
+    table = FILES[name]
+    scene = table.get("scale", {}).get(scale, {}).get("scene")
+    names = [s["name"] for s in scene] if isinstance(scene, list) else [s["name"] for s in table["scene"]]
+    scenes = [s["name"] for s in table["scene"] if "file" in s and s["name"] in names]
+    return config.load(FOLDER / name, dict.fromkeys(scenes, tmp_path / "room.xml"), scale)
+
+
+SCALES = [(name, scale) for name, table in FILES.items() for scale in (None, *table.get("scale", {}))]
+
+
+@pytest.mark.parametrize("name, scale", SCALES)
+def test_every_experiment_loads_at_every_scale(tmp_path, name, scale):
+    """A dry run: nothing is loaded, compiled or rendered."""
+    experiment = of_this_project(tmp_path, name, scale)
+    plan = run.plan(experiment, tmp_path)
+    assert plan["cells"] == plan["todo"] and 0 < plan["gigabytes"] < 16
+    if scale == "small" and plan["hours"] is not None:
+        assert plan["hours"] * 3600 <= SMALL_SECONDS
+    assert "small" in experiment.scale or scale
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_small_scale_needs_no_reference_of_its_own(tmp_path, name):
+    """The full scale's, or the quickstart's, of a whole multiple of its size, is averaged."""
+    there = {e.reference_key(s) for e in (of_this_project(tmp_path, name), of_this_project(tmp_path, "quickstart.toml"))
+             for s in e.scene}
+    small = of_this_project(tmp_path, name, "small")
+    for scene in (s for s in small.scene if s.has_reference):
+        sizes = ({"width": k * scene.width, "height": k * scene.height} for k in range(1, run.LARGER + 1))
+        assert there & {small.reference_key(scene.model_copy(update=size)) for size in sizes}
+
+
+@pytest.mark.parametrize("name", ["door_ajar.toml", "classroom.toml", "living_room.toml", "simple_scene.toml"])
+@pytest.mark.parametrize("scale", [None, "small"])
+def test_the_talks_method_and_its_modern_version_stand_side_by_side(tmp_path, name, scale):
+    experiment = of_this_project(tmp_path, name, scale)
+    scene, (plain, paper, best) = experiment.scene[0], experiment.method
+    assert plain.representation is None and paper.representation == best.representation == {"type": "gaussian_mixture"}
+    for method, preset in ((paper, "paper2014"), (best, "best")):
+        wanted, found = settings.training(preset), experiment.training_of(method)
+        amounts = {key: getattr(found, key) for key in ("passes", "photons", "importons")}
+        assert found == dataclasses.replace(wanted, **amounts) and method.name == f"GMM, {preset}"
+        assert experiment.integrator_of(scene, method) == settings.integrator(preset)
+
+
+@pytest.mark.parametrize("name", ["single_batch.toml", "single_batch_time.toml"])
+@pytest.mark.parametrize("scale", [None, "small"])
+def test_methods_of_one_batch_differ_in_nothing_but_the_representation(tmp_path, name, scale):
+    experiment = of_this_project(tmp_path, name, scale)
+    trained = {}
+    for method in (m for m in experiment.method if m.representation):
+        training = experiment.training_of(method)
+        assert (training.schedule, training.passes, training.camera_passes, training.neighbours) == ("single_batch", 1, 0, 250)
+        series = method.series.name if method.series else method.name
+        trained.setdefault(series, []).append((training, experiment.integrator_of(experiment.scene[0], method)))
+    assert list(trained) == ["Jensen", "Hey", "GMM"] and trained["Jensen"] == trained["Hey"] == trained["GMM"]
+
+
+@pytest.mark.parametrize("scale", [None, "small"])
+def test_who_guides_whom_is_compared_with_as_many_particles(tmp_path, scale):
+    experiment = of_this_project(tmp_path, "interleaving.toml", scale)
+    trained = [experiment.training_of(method) for method in experiment.method[1:]]
+    assert len({t.passes * (t.photons + t.importons) for t in trained}) == 1
+    assert [t.importons > 0 for t in trained] == [False, True, True] and {t.share for t in trained} == {1}
+
+
+def test_the_committed_reference_keeps_its_key():
+    quickstart = config.load(FOLDER / "quickstart.toml")
+    assert quickstart.reference_key(quickstart.scene[0]) == "door_ajar-96x54-075c0ded"
+
+
+def test_the_ablation_leaves_out_one_addition_at_a_time(tmp_path):
+    experiment = of_this_project(tmp_path, "ablation.toml")
+    best, *others = ({**dataclasses.asdict(c.integrator), **dataclasses.asdict(c.training)} for c in
+                     experiment.cells()[:len(experiment.method)])
+    assert experiment.baseline_name == experiment.method[0].name == "best" and len(experiment.seeds) >= 8
+    for other in others:
+        assert sum(other[key] != best[key] for key in best) == 1
+
+
+def test_the_targets_compare_presets_with_plain_path_tracing(tmp_path):
+    experiment = of_this_project(tmp_path, "targets.toml")
+    scene, names = experiment.scene[0], [method.name for method in experiment.method]
+    assert experiment.baseline_name == "Path tracing" and experiment.method[0].representation is None
+    for name, method in zip(names[1:], experiment.method[1:], strict=True):
+        preset = name.removeprefix("GMM ")
+        assert experiment.training_of(method) == settings.training(preset)
+        assert experiment.integrator_of(scene, method) == settings.integrator(preset)

@@ -1,0 +1,118 @@
+"""The figure of sweeps against a results folder whose errors and memory are known."""
+from __future__ import annotations
+
+import itertools
+from types import SimpleNamespace
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from skimage.io import imread
+
+from olpm_bench.bench import config
+from olpm_bench.bench.results import Reference, ResultError, Results
+from olpm_bench.report import figures, sweeps
+
+TRUTH = np.ones((6, 8, 3), np.float32)
+ERRORS = {"Path tracing": 0.9, "Stored": 2.0, "On-line": 1.0}      # over sqrt(passes) but for path tracing
+
+
+def made(tmp_path, reference: str | None = None, **sweep) -> SimpleNamespace:
+    """Cells with errors of ERRORS times 0.9, 1, 1.2 for three seeds; 1000 photons a pass, all stored or one pass at a time."""
+    scene = {"name": "door_ajar", "width": 8, "height": 6} | ({"reference": reference} if reference else {})
+    series = {"representation": {"type": "jensen"}, "sweep": {"training.passes": [1, 4, 16]}}
+    experiment = config.parse({
+        "title": "Synthetic", "seeds": 3, "budget": {"spp": 16}, "scene": [scene], "sweep": sweep, "method": [
+            {"name": "Path tracing"}, {"name": "Stored", **series, "training": {"schedule": "single_batch"}},
+            {"name": "On-line", **series}]}, "synthetic.toml", tmp_path)
+    results = Results(tmp_path / "results" / "synthetic")
+    for cell in experiment.cells():
+        name, passes = (cell.method.series.name, int(cell.method.series.value)) if cell.method.series else (cell.method.name, 0)
+        image = TRUTH + np.float32(ERRORS[name] * (0.9, 1, 1.2)[cell.seed] / np.sqrt(max(passes, 1)))
+        trained = [{"photons": 1000 * passes, "stored": 10_000 * passes}] if name == "Stored" else (
+            [{"photons": 1000, "stored": 10_000}] * passes)
+        info = {"key": cell.key, "records": 100 if passes else 0, "bytes_per_record": 200, "train_seconds": 0.5 * passes,
+                "passes": trained}
+        results.write_cell(cell.scene.name, cell.method.name, cell.seed, info, [{"seconds": 1.0, "train_seconds": 0, "spp": 16}],
+                           {"mean": image, "variance": TRUTH, "count": TRUTH[..., 0]}, [image])
+    results.write_json("env.json", {"schema_version": 1, "cpu": "Abacus 2", "threads": 2})
+    reference = Reference(TRUTH, TRUTH + 0.01, TRUTH, TRUTH, {"spp_a": 1, "spp_b": 0})
+    return SimpleNamespace(experiment=experiment, results=results, references={"door_ajar": reference})
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What `sweeps` draws: its panels, and the figure."""
+    seen = SimpleNamespace(panels=[], figure=None)
+    draw = figures.draw
+
+    def keep(panels, *arguments):
+        seen.panels, seen.figure = panels, draw(panels, *arguments)
+        return seen.figure
+
+    monkeypatch.setattr(figures, "draw", keep)
+    return seen
+
+
+def test_a_curve_a_series_over_the_setting_and_level_lines(tmp_path, drawn):
+    known = made(tmp_path)
+    assert sweeps.sweeps(known.results, known.experiment, known.references)
+    panel, = drawn.panels
+    assert (panel.abscissa, panel.ordinate, panel.slope) == ("passes", "L1 error", False)
+    assert list(panel.curves) == ["Path tracing", "Stored", "On-line"]
+    np.testing.assert_array_equal(panel.curves["Stored"].times, [1, 4, 16])
+    np.testing.assert_allclose(panel.curves["Stored"].median, [2, 1, 0.5], rtol=1e-6)
+    np.testing.assert_array_equal(panel.curves["Path tracing"].times, [1, 16])
+    np.testing.assert_allclose(panel.curves["Path tracing"].median, 0.9, rtol=1e-6)
+    assert panel.curves["On-line"].errors.shape == (3, 3) and panel.floor == pytest.approx(0.005, rel=1e-3)
+    assert imread(known.results.folder / "sweep.png").std() > 5
+    assert (known.results.folder / "sweep.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_memory_over_the_photons_traced(tmp_path, drawn):
+    """Stored, 48 bytes a particle grow; on-line, those of one pass do not.  What learns nothing has no curve."""
+    known = made(tmp_path, x="photons", y=["l1", "bytes", "train_seconds"])
+    assert sweeps.sweeps(known.results, known.experiment, known.references)
+    _, memory, seconds = drawn.panels
+    assert memory.abscissa == "photons traced" and list(memory.curves) == ["Stored", "On-line"] == list(seconds.curves)
+    assert memory.looks == seconds.looks == ("Path tracing", "Stored", "On-line")
+    for curve in memory.curves.values():
+        np.testing.assert_array_equal(curve.times, [1000, 4000, 16_000])
+    np.testing.assert_allclose(memory.curves["Stored"].median, 0.02 + 0.48 * np.array([1, 4, 16]))
+    np.testing.assert_allclose(memory.curves["On-line"].median, 0.5)
+    np.testing.assert_allclose(seconds.curves["On-line"].median, [0.5, 2, 8])
+
+
+def test_no_text_overlaps_another_or_leaves_the_figure(tmp_path, drawn):
+    known = made(tmp_path, x="photons", y=["l1", "bytes"])
+    sweeps.sweeps(known.results, known.experiment, known.references)
+    with figures.style():
+        figure = drawn.figure
+        figure.set_dpi(matplotlib.rcParams["savefig.dpi"])
+        FigureCanvasAgg(figure).draw()
+    renderer, (width, height) = figure.canvas.get_renderer(), figure.canvas.get_width_height()
+    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in figure.findobj(matplotlib.text.Text)
+             if text.get_text() and text.get_visible()]
+    assert {"Stored", "On-line", "L1 error", "memory of learning [MB]"} <= {text for text, _ in boxes}
+    for text, box in boxes:
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height, f"{text!r} is cut off"
+    for (text, box), (other, other_box) in itertools.combinations(boxes, 2):
+        assert not box.padded(-0.5).overlaps(other_box.padded(-0.5)), f"{text!r} lies on {other!r}"
+
+
+def test_errors_need_a_reference_and_memory_does_not(tmp_path, drawn):
+    known = made(tmp_path, reference="none", y=["l1", "bytes"])
+    assert sweeps.sweeps(known.results, known.experiment, {})
+    assert [panel.ordinate for panel in drawn.panels] == ["memory of learning [MB]"]
+    bare = made(tmp_path, reference="none", y=["relmse"])
+    assert not sweeps.sweeps(bare.results, bare.experiment, {})
+
+
+def test_nothing_is_drawn_without_a_sweep_and_refused_without_its_cells(tmp_path, finished):
+    assert not sweeps.sweeps(finished.results, finished.experiment, finished.references)
+    known = made(tmp_path)
+    (known.results.cell_folder("door_ajar", "Stored, passes 4", 1) / "cell.json").unlink()
+    with pytest.raises(ResultError, match=r"Stored, passes 4 / seed 1 .* is missing; make it with: olpm-bench run "):
+        sweeps.sweeps(known.results, known.experiment, known.references)
+    assert not list(known.results.folder.glob("sweep.*"))
