@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -75,16 +76,24 @@ def _interrupt(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def _load(path: Path, replacements: list[str] | None = None, scale: str | None = None) -> Any:
-    """The experiment, at a scale of its own if one is named, with `NAME=PATH` options applied."""
+def _replacements(texts: list[str] | None) -> dict[str, Path]:
+    """`NAME=PATH` options as a dictionary."""
     from olpm_bench.bench import config
 
     scenes = {}
-    for text in replacements or []:
+    for text in texts or []:
         name, equals, file = text.partition("=")
         if not equals or not name or not file:
             raise config.ConfigError(f"--scene {text}: must be NAME=PATH")
         scenes[name] = Path(file)
+    return scenes
+
+
+def _load(path: Path, replacements: list[str] | None = None, scale: str | None = None) -> Any:
+    """The experiment, at a scale of its own if one is named, with `NAME=PATH` options applied."""
+    from olpm_bench.bench import config
+
+    scenes = _replacements(replacements)
     if path.is_file() and ".py:" in path.read_text(encoding="utf-8", errors="replace"):
         from olpm_bench.bench import environment
 
@@ -97,6 +106,8 @@ def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), sc
         only: Only = [],  # noqa: B006
         scale: Scale = None,
         dry_run: Annotated[bool, typer.Option("--dry-run", help="Print cells, hours and memory; run nothing.")] = False,
+        shard: Annotated[str, typer.Option(metavar="I/N", help="Run a part of the cells, and leave the others to other machines "
+                                                               "that share the folder: 1/N to N/N.")] = "1/1",
         ) -> None:
     """Run an experiment, or what is missing of it; then print its table and draw its figures."""
     from olpm_bench.bench import environment
@@ -104,22 +115,92 @@ def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), sc
     loaded = _load(experiment, scene, scale)
     environment.select_variant()
     from olpm_bench.bench import run as runner
+    from olpm_bench.bench.shard import WHOLE, Shard
 
+    part = Shard.parse(shard)
     if dry_run:
-        plan = runner.plan(loaded.of_scenes(only), results)
+        plan = runner.plan(loaded.of_scenes(only), results, part)
         hours = "unknown" if plan["hours"] is None else f"{plan['hours']:.2f}, and compilation"
         for spec in plan["cells"]:
             print(f"{spec}{'' if spec in plan['todo'] else '  (complete)'}")
         print(f"{len(plan['todo'])} of {len(plan['cells'])} cells to run; hours: {hours}; "
               f"memory: about {plan['gigabytes']:.1f} GB")
         return
-    problems = runner.run(loaded, results, only)
+    problems = runner.run(loaded, results, only, part)
     if problems:
         for problem in problems:
             complain(problem)
-        complain(f"{len(problems)} of {len(loaded.of_scenes(only).cells())} cells are not complete; no table and no figures")
+        cells = part.of(loaded.of_scenes(only).cells())
+        complain(f"{len(problems)} of {len(cells)} cells are not complete; no table and no figures")
         raise typer.Exit(FAILED)
+    if part != WHOLE and (left := runner.plan(loaded.of_scenes(only), results)["todo"]):
+        print(f"shard {part} is complete; no table and no figures yet: {len(left)} cells of other shards are missing")
+        return
     runner.report(loaded, results, only)
+
+
+@command
+def submit(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
+           scale: Scale = None,
+           workers: Annotated[int, typer.Option(min=1, help="Machines (slurm), or processes (local).")] = 1,
+           cluster: Annotated[str, typer.Option(metavar="slurm|local", help="A Slurm cluster, or this machine.")] = "slurm",
+           minutes: Annotated[int, typer.Option(min=1, help="Longest that a worker runs.")] = 1440,
+           partition: Annotated[str | None, typer.Option(help="Of Slurm.", show_default=False)] = None,
+           account: Annotated[str | None, typer.Option(help="Of Slurm.", show_default=False)] = None,
+           constraint: Annotated[str | None, typer.Option(help="Of Slurm: the feature that names one CPU model.",
+                                                          show_default=False)] = None) -> None:
+    """Run an experiment by workers that share its folder, on the nodes of a cluster or on this machine."""
+    from olpm_bench.bench import environment
+
+    loaded = _load(experiment, scene, scale)
+    environment.select_variant()
+    try:
+        from olpm_bench.bench import submit as submission
+    except ModuleNotFoundError as error:
+        raise InputError(f"submit needs {error.name}: pip install 'olpm-bench[cluster]'") from None
+    from olpm_bench.bench import run as runner
+
+    runner.references(loaded, results)          # before the cluster is asked
+    jobs = submission.submit(loaded, results, cluster, workers, minutes, _replacements(scene), scale,
+                             partition=partition, account=account, constraint=constraint)
+    if cluster == "slurm":
+        print(f"submitted: {', '.join(job.job_id for job in jobs)}; once they have ended, this draws the figures: "
+              f"{shlex.join([*loaded.command('run'), '--results', str(results)])}")
+        return
+    submission.wait(jobs, loaded, results)
+    if left := runner.plan(loaded, results)["todo"]:
+        for spec in left:
+            complain(f"{spec} is not complete")
+        complain(f"{len(left)} of {len(loaded.cells())} cells are not complete; no table and no figures; "
+                 f"logs are in {results / loaded.stem / 'jobs'}")
+        raise typer.Exit(FAILED)
+    runner.report(loaded, results)
+
+
+@command
+def gate(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
+         scale: Scale = None) -> None:
+    """Put an experiment's claims to the test, after running what is missing; exit code 1 if one fails."""
+    from olpm_bench.bench import environment
+
+    loaded = _load(experiment, scene, scale)
+    environment.select_variant()
+    from olpm_bench.bench import gate as gates
+    from olpm_bench.bench import run as runner
+    from olpm_bench.bench.results import Results
+
+    gates.check(loaded)
+    if problems := runner.run(loaded, results):
+        for problem in problems:
+            complain(problem)
+        complain(f"{len(problems)} of {len(loaded.cells())} cells are not complete; no verdict")
+        raise typer.Exit(FAILED)
+    folder = Results(results / loaded.stem)
+    verdicts = gates.judge(loaded, folder, runner.references(loaded, results))
+    gates.write(verdicts, folder)
+    gates.print_verdicts(verdicts)
+    if not all(verdict.holds for verdict in verdicts):
+        raise typer.Exit(FAILED)
 
 
 @command
@@ -134,6 +215,48 @@ def reference(experiment: ExperimentFile, results: ResultsFolder = Path("results
     from olpm_bench.bench import reference as references
 
     references.improve(loaded, results, seconds)
+
+
+@command
+def metrics(experiment: Annotated[Path, typer.Argument(metavar="RESULTS|EXPERIMENT.toml", show_default=False,
+                                                       help="A folder of results, or the TOML that they are of.")],
+            results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
+            scale: Scale = None) -> None:
+    """Compute every metric anew from the images of an experiment; nothing is rendered."""
+    is_folder = experiment.is_dir()
+    loaded = _load(experiment / "experiment.toml" if is_folder else experiment, scene, scale)
+    folder = experiment if is_folder else results / loaded.stem
+    from olpm_bench.bench import environment
+
+    environment.select_variant()
+    from olpm_bench.bench import run as runner
+    from olpm_bench.bench import summary
+    from olpm_bench.bench.results import Results
+
+    stored = Results(folder)
+    found = summary.summarise(loaded, stored, runner.references(loaded, folder.resolve().parent), any_version=True)
+    summary.write(found, stored)
+    summary.print_metrics(found)
+    if outdated := sum(not runner.is_complete(stored, spec)[0] for spec in loaded.cells()):
+        print(f"{outdated} of {len(loaded.cells())} cells were made by other code, or of another file of the scene")
+    print(f"in {folder}: summary.json, table.csv")
+
+
+@command
+def compare(a: Annotated[Path, typer.Argument(metavar="A.exr", show_default=False)],
+            b: Annotated[Path, typer.Argument(metavar="B.exr", show_default=False)],
+            reference: Annotated[Path | None, typer.Option(
+                metavar="R.exr", help="Or a folder of references; B by default.", show_default=False)] = None,
+            as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False) -> None:
+    """Compare two images with a reference, or with each other, by every metric."""
+    from olpm_bench.bench import compare as comparing
+    from olpm_bench.bench.results import plain
+
+    found = comparing.compare(a, b, reference)
+    if as_json:
+        print(json.dumps(plain(found.as_dict()), allow_nan=False))
+    else:
+        comparing.print_comparison(found)
 
 
 @command

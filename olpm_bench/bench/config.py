@@ -34,6 +34,7 @@ from pydantic import (
 import representations
 from olpm_bench import scenes as embedded
 from olpm_bench import transport
+from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
 from olpm_bench.bench.results import SCHEMA_VERSION, slug
 from olpm_bench.bench.scale import scaled
 from olpm_bench.bench.sweep import expanded
@@ -174,6 +175,27 @@ class Method(Table):
         return representations.create(self.representation["type"], **self.representation_parameters)
 
 
+class Claim(Table):
+    """What `olpm-bench gate` proves or refutes: in each scene, one method's error is at most `ratio` times another's.
+
+    better, worse: names of methods.
+    metric: an error (of a scene with reference), or a variance over seeds; see `bench.metrics`.
+    confidence: of the one-sided bound that must not exceed `ratio`.
+    """
+    better: str
+    worse: str
+    metric: str = "relmse"
+    ratio: float = Field(1.0, gt=0, allow_inf_nan=False)
+    confidence: float = Field(0.95, ge=0.5, lt=1)
+
+    @field_validator("metric")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in (known := [*METRICS, *OVER_SEEDS]):
+            raise ValueError(f"must be one of {', '.join(known)}")
+        return value
+
+
 @dataclass(frozen=True)
 class CellSpec:
     """All that determines a cell: one scene, one method, one seed, one budget."""
@@ -227,6 +249,7 @@ class Experiment(Table):
     integrator: IntegratorSettings = IntegratorSettings()
     training: TrainingSettings = TrainingSettings()
     method: list[Method] = Field(min_length=1)
+    claim: list[Claim] = []
     sweep: SweepFigure = SweepFigure()
     scale: dict[str, dict[str, Any]] = {}
     _path: Path = PrivateAttr(Path("EXPERIMENT.toml"))
@@ -287,6 +310,12 @@ class Experiment(Table):
                                      "differ")
         if self.baseline_name not in (known := [m.name for m in self.method]):
             raise ValueError(f"baseline = {self.baseline!r}: no method of this name; known: {', '.join(known)}")
+        for number, claim in enumerate(self.claim, 1):
+            for key, name in (("better", claim.better), ("worse", claim.worse)):
+                if name not in known:
+                    raise ValueError(f"[[claim]] {number}: {key} = {name!r}: no method of this name; known: {', '.join(known)}")
+            if claim.better == claim.worse:
+                raise ValueError(f"[[claim]] {number}: {claim.better!r} is compared with itself")
         for method in self.method:
             self.training_of(method)
             for scene in self.scene:
@@ -381,7 +410,8 @@ class Experiment(Table):
             "schema_version": SCHEMA_VERSION, "title": self.title, "description": self.description, "seeds": self.seeds,
             "baseline": self.baseline_name, "budget": self.budget.model_dump(exclude_none=True),
             "integrator": dataclasses.asdict(self.integrator), "training": dataclasses.asdict(self.training),
-            "sweep": self.sweep.model_dump(), "scene": scenes, "method": methods}
+            "sweep": self.sweep.model_dump(), "scene": scenes, "method": methods,
+            "claim": [claim.model_dump() for claim in self.claim]}
 
     def toml(self, relative_to: Path | None = None) -> str:
         """`resolved` as TOML; reading it back gives the same cells."""
@@ -560,7 +590,7 @@ def _check_scene(scene: Scene, source: str, replaceable: bool) -> None:
         raise ConfigError(f"{where}: reference {scene.reference}: there is no such file or folder; \"none\" does without")
 
 
-TABLES = {"budget": Budget, "scene": Scene, "method": Method, "sweep": SweepFigure,
+TABLES = {"budget": Budget, "scene": Scene, "method": Method, "claim": Claim, "sweep": SweepFigure,
           "integrator": IntegratorSettings, "training": TrainingSettings}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import socket
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,11 @@ def describe() -> dict[str, Any]:
         "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
     }
+
+
+def machine() -> dict[str, Any]:
+    """What goes into cell.json, where several machines make an experiment."""
+    return {"host": socket.gethostname(), "cpu": _cpu(), "cores": cores()}
 
 
 def _cpu() -> str:

@@ -91,10 +91,12 @@ def flip(x: np.ndarray, r: np.ndarray) -> float:
 
 
 def ssim_error(x: np.ndarray, r: np.ndarray) -> float:
-    """1 - SSIM [Wang et al. 2004] of the tone-mapped images, at the reference's exposure."""
+    """1 - SSIM [Wang et al. 2004] of the tone-mapped images, at the reference's exposure; NaN below its window of 7 x 7."""
     from skimage.metrics import structural_similarity
 
     _pair(x, r)
+    if min(x.shape[:2]) < 7:
+        return float("nan")
     exposure = tonemap.auto_exposure(r)
     shown_x, shown_r = tonemap.encode(x, exposure), tonemap.encode(r, exposure)
     return float(1 - structural_similarity(shown_x, shown_r, data_range=1, channel_axis=-1))
@@ -122,5 +124,11 @@ def relative_variance(Y: np.ndarray) -> float:
         return float(np.median(Y.var(axis=0, ddof=1) / (mean**2 + 1e-3 * mean.mean() ** 2)))
 
 
+# The registries: a new metric is a function and its name here; summaries, comparisons and claims know it by that.
 METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     f.__name__: f for f in (l1, mape, smape, relmse, relmse_trimmed, flip, ssim_error)}
+# Of the luminances of all seeds (seeds, h, w) and their charged seconds (seeds); they need no reference.
+OVER_SEEDS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
+    "relative_variance": lambda Y, seconds: relative_variance(Y),
+    "work_normalised_variance": lambda Y, seconds: relative_variance(Y) * float(seconds.mean()),
+}

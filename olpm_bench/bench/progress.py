@@ -14,8 +14,8 @@ QUIET_SECONDS = 30.0        # between lines where there is no terminal
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """Whether Ctrl-C or SIGTERM is behind an error: while Dr.Jit traces a loop they become a RuntimeError."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
+    """Whether Ctrl-C, SIGTERM or a cluster's wish is behind an error: while Dr.Jit traces a loop they become a RuntimeError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
         error = error.__cause__ or error.__context__
     return error is not None
 

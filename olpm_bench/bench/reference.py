@@ -100,7 +100,7 @@ def improve(experiment: Experiment, root: Path, seconds: float) -> dict[str, Pat
 def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float, bar: Bar, done: float) -> Path:
     key = spec.reference_key
     folder = root / "references" / key
-    with locked(folder):
+    with locked(folder) as alive:
         halves = Halves.start(spec.scene.width, spec.scene.height,
                               find_reference(key, reference_folders(experiment, root)))
         scene = cell.load_scene(spec)
@@ -119,6 +119,7 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
                     image = cell.to_numpy(rendered)
                     cell.check_pixels(image, f"the pass with seed {seed + half.passes}")
                     half.add(image, spp)
+                alive()
                 halves.seconds = before + clock.charged
                 bar.at(done + clock.charged, f"{spec.scene.name}: {halves}")
                 if time.monotonic() - saved > SAVE_SECONDS:

@@ -22,8 +22,9 @@ import os
 import re
 import shutil
 import socket
+import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,6 +35,9 @@ import numpy as np
 from olpm_bench.transport.settings import InputError
 
 SCHEMA_VERSION = 1
+LEASE = 1800.0          # [s] without a sign of life after which a lock counts as left behind
+SIGNING = 10.0          # [s] until a lock is signed, at most
+BEAT = 30.0             # [s] between signs of life, at least
 
 
 class ResultError(InputError):
@@ -197,6 +201,10 @@ class Cell:
             if name not in parts:
                 raise ResultError(f"{self.folder / 'image.exr'} is broken: no part '{name}'")
         return parts
+
+    def config(self) -> dict[str, Any]:
+        """What determined it, from the header of its image."""
+        return read_exr(self.folder / "image.exr")[1]
 
     def checkpoints(self) -> list[np.ndarray]:
         """The mean image (h, w, 3) at each line of the trace."""
@@ -362,6 +370,14 @@ class Results:
         (folder / "failed.json").unlink(missing_ok=True)
         return Cell(scene, method, seed, info, trace, folder)
 
+    def failure(self, scene: str, method: str, seed: int) -> tuple[int, str] | None:
+        """When a run of the cell failed [ns] and why; None if none did since it last was complete."""
+        path = self.cell_folder(scene, method, seed) / "failed.json"
+        try:
+            return path.stat().st_mtime_ns, str(read_json(path).get("reason"))
+        except (OSError, ResultError):
+            return None
+
     def write_failure(self, scene: str, method: str, seed: int, reason: str) -> None:
         """Say why a cell is not complete.  One of other settings that is there stays."""
         write_json(self.cell_folder(scene, method, seed) / "failed.json",
@@ -369,26 +385,46 @@ class Results:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[Callable[[], None]]:
     """Hold a folder (of a cell or a reference) while the body runs, by a file `lock` in it.
 
-    The lock of a process of this host that no longer lives is taken over, and its unfinished files are removed.
+    Yields a function that the body calls now and then as a sign of life; it raises LockedError if the lock is lost.
+
+    The lock of a process of this host that no longer lives is taken over, and any after half an hour without a sign of life;
+    unfinished files are removed.
 
     Raises:
         LockedError: another process holds it.
     """
     path = folder / "lock"
     folder.mkdir(parents=True, exist_ok=True)
-    _acquire(path)
+    mine, last = _acquire(path), time.monotonic()
+
+    def is_mine() -> bool:
+        try:
+            return path.read_text() == mine
+        except FileNotFoundError:
+            return False
+
+    def alive() -> None:
+        nonlocal last
+        if time.monotonic() - last < BEAT:
+            return
+        if not is_mine():
+            raise LockedError(f"{path} was lost to another process, after {time.monotonic() - last:.0f} s without a sign of life")
+        os.utime(path)
+        last = time.monotonic()
+
     try:
         for left in folder.glob(".*.tmp*"):
             if left.is_dir():
                 shutil.rmtree(left, ignore_errors=True)
             else:
                 left.unlink(missing_ok=True)
-        yield
+        yield alive
     finally:
-        path.unlink(missing_ok=True)
+        if is_mine():
+            path.unlink(missing_ok=True)
 
 
 def _identity() -> dict[str, Any]:
@@ -396,9 +432,16 @@ def _identity() -> dict[str, Any]:
     return {"pid": os.getpid(), "host": socket.gethostname(), "started": psutil.Process().create_time()}
 
 
-def _is_stale(owner: dict[str, Any]) -> bool:
-    """The owner was a process of this host and is gone; another process with its number does not count."""
+def _is_stale(owner: dict[str, Any], touched: float) -> bool:
+    """The owner was a process of this host and is gone (another process with its number does not count), was killed before it
+    had signed, or has been silent for too long.
+
+    Args:
+        touched: when the lock last showed a sign of life.
+    """
     import psutil
+    if time.time() - touched > (LEASE if owner else SIGNING):
+        return True
     if owner.get("host") != socket.gethostname():
         return False
     try:
@@ -409,20 +452,21 @@ def _is_stale(owner: dict[str, Any]) -> bool:
         return False
 
 
-def _acquire(path: Path) -> None:
+def _acquire(path: Path) -> str:
+    """Create the lock; return what it says."""
     identity = json.dumps(_identity())
     for _ in range(3):
         try:
             handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
         except FileExistsError:
             try:
-                text = path.read_text()
-                owner = json.loads(text)
+                text, touched = path.read_text(), path.stat().st_mtime
+                owner = json.loads(text or "{}")        # empty: about to be written
             except FileNotFoundError:                   # released meanwhile
                 continue
             except ValueError:
                 raise LockedError(f"{path} is held by somebody unknown; delete it if nothing runs") from None
-            if not _is_stale(owner):
+            if not _is_stale(owner, touched):
                 raise LockedError(f"{path} is held by process {owner.get('pid')} on {owner.get('host')}") from None
             aside = path.with_name(f".lock.{socket.gethostname()}-{os.getpid()}")
             try:
@@ -437,7 +481,7 @@ def _acquire(path: Path) -> None:
             os.write(handle, identity.encode())
         finally:
             os.close(handle)
-        return
+        return identity
     raise LockedError(f"{path} is contended")
 
 

@@ -2,7 +2,8 @@
 from __future__ import annotations
 
 import shlex
-from collections import Counter
+import time
+from collections import Counter, deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,10 @@ from olpm_bench.bench.results import (
     locked,
     read_reference,
 )
+from olpm_bench.bench.shard import WHOLE, Shard
 
 LARGER = 8                  # references are averaged down by whole factors up to this
+PATIENCE = 2.0              # [s] between looks at what is in other hands
 TRAINED = 0.5               # share of trained records below which a guide is reported: most paths are then unguided
 
 
@@ -60,14 +63,17 @@ def _reference(experiment: Experiment, scene: Scene, root: Path) -> Path | None:
 
 def reference_folders(experiment: Experiment, root: Path) -> list[Path]:
     """Where references are looked for, in this order."""
-    return [root / "references", experiment.path.parent / ".." / "results" / "references"]
+    return [root / "references", experiment.path.parent / ".." / "results" / "references", Path("results") / "references"]
 
 
-def run(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> list[str]:
+def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Shard = WHOLE, together: bool = False) -> list[str]:
     """Run what is not complete of an experiment; return one line for each cell that is not complete afterwards.
 
     Args:
         only: scenes to run; all by default.
+        shard: the share of the cells to run.
+        together: then run what the other shards have left, and wait for what is in other hands, so that all is complete
+            in the end, whoever is killed meanwhile.
 
     Raises:
         ConfigError: no such scene.
@@ -76,7 +82,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> list[st
     """
     results, part = Results(root / experiment.stem), experiment.of_scenes(only)
     references(part, root)                                  # before hours of work, not after
-    cells = part.cells()
+    cells = shard.first(part.cells()) if together else shard.of(part.cells())
     loaded = {spec.scene.name: load_scene(spec) for spec in {c.scene.name: c for c in cells}.values()}
     todo, problems = [], []
     for spec in cells:
@@ -87,15 +93,26 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> list[st
     results.write_json("env.json", environment.describe())
 
     warm: dict[tuple[str, str], WarmUp] = {}
+    failures = {str(spec): results.failure(spec.scene.name, spec.method.name, spec.seed) for spec, _ in todo}
+    queue, held = deque(enumerate(todo)), 0
     with Bar(len(todo)) as bar:
         if len(todo) < len(cells):
             bar.say(f"{len(cells) - len(todo)} of {len(cells)} cells are complete already")
-        for index, (spec, why) in enumerate(todo):
+        while queue:
+            index, (spec, why) = queue.popleft()
             if why:
                 bar.say(f"{spec}: {why}; redone")
             try:
-                cell = _run_cell(results, spec, loaded[spec.scene.name], warm, bar, index)
+                cell = _run_cell(results, spec, loaded[spec.scene.name], warm, bar, index, failures[str(spec)])
+                held = 0
             except (CellFailedError, LockedError) as error:
+                if together and isinstance(error, LockedError):
+                    queue.append((index, (spec, "")))
+                    held += 1
+                    if held >= len(queue):          # all that is left is in other hands
+                        time.sleep(PATIENCE)
+                        held = 0
+                    continue
                 problems.append(f"{spec}: {error}")
                 bar.say(problems[-1])
                 continue
@@ -129,18 +146,28 @@ def is_complete(results: Results, spec: CellSpec) -> tuple[bool, str]:
 
 
 def _run_cell(results: Results, spec: CellSpec, scene: mi.Scene, warm: dict[tuple[str, str], WarmUp], bar: Bar,
-              index: int) -> Cell | None:
+              index: int, failure: tuple[int, str] | None) -> Cell | None:
+    """Run a cell; None if another process has done so meanwhile.
+
+    Args:
+        failure: what was known of a failure of it before; another process's since then counts.
+    """
     names = spec.scene.name, spec.method.name, spec.seed
-    with locked(results.cell_folder(*names)):
-        if is_complete(results, spec)[0]:       # by another process, meanwhile
+    with locked(results.cell_folder(*names)) as alive:
+        if is_complete(results, spec)[0]:
             return None
+        if (now := results.failure(*names)) is not None and now != failure:
+            raise CellFailedError(now[1])
+
+        def on_progress(share: float, what: str) -> None:
+            alive()
+            bar.at(index + share, f"{spec}: {what}")
         try:
             pair = names[:2]
             if pair not in warm:
                 bar.at(index, f"{spec}: compiling")
                 warm[pair] = warm_up(spec, scene)
-            done = measure(spec, scene, warm[pair],
-                           on_progress=lambda share, what: bar.at(index + share, f"{spec}: {what}"))
+            done = measure(spec, scene, warm[pair], on_progress=on_progress)
         except CellFailedError as error:
             results.write_failure(*names, str(error))
             raise
@@ -149,13 +176,14 @@ def _run_cell(results: Results, spec: CellSpec, scene: mi.Scene, warm: dict[tupl
                 raise KeyboardInterrupt from error
             results.write_failure(*names, reason(error))
             raise CellFailedError(reason(error)) from error
-        return results.write_cell(*names, done.info, done.trace, done.image, done.checkpoints, spec.config())
+        info = {**done.info, "machine": environment.machine()}
+        return results.write_cell(*names, info, done.trace, done.image, done.checkpoints, spec.config())
 
 
-def plan(experiment: Experiment, root: Path) -> dict[str, Any]:
+def plan(experiment: Experiment, root: Path, shard: Shard = WHOLE) -> dict[str, Any]:
     """What a run would do: cells, those to run, hours (None for a budget of samples), gigabytes of memory."""
     results = Results(root / experiment.stem)
-    cells = experiment.cells()
+    cells = shard.of(experiment.cells())
     todo = [spec for spec in cells if not is_complete(results, spec)[0]]
     seconds = [spec.budget.seconds for spec in todo]
     return {"cells": cells, "todo": todo, "hours": sum(s for s in seconds if s) / 3600 if None not in seconds else None,
@@ -192,6 +220,8 @@ def report(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> None
     found = references(experiment, root)
     summarised = summary.summarise(experiment, results, found)
     summary.print_table(summarised)
+    if experiment.budget.seconds is not None and len(cpus := summary.cpus(experiment, results)) > 1:
+        print(f"made on different CPUs, whose seconds do not compare: {', '.join(cpus)}")
     if len(experiment.method) > 1:
         summary.print_speed_ups(summary.speed_ups(experiment, results, found), experiment.baseline_name)
     if missing:

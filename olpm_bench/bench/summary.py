@@ -19,33 +19,44 @@ from olpm_bench.bench.results import SCHEMA_VERSION, Cell, Reference, ResultErro
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from olpm_bench.bench.config import Experiment, Scene
 
-COLUMNS = ("scene", "method", "seeds", "l1", "l1_low", "l1_high", "relmse", "relmse_trimmed",
-           "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "training_passes",
-           "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records", "bytes_per_record",
-           "particles", "invalid_pixels")
 
-
-def complete_cells(experiment: Experiment, results: Results) -> dict[tuple[str, str], list[Cell]]:
+def complete_cells(experiment: Experiment, results: Results, any_version: bool = False) -> dict[tuple[str, str], list[Cell]]:
     """Every cell of the experiment: (scene, method) -> one per seed, in the order of the TOML.
+
+    Args:
+        any_version: cells of these settings count also if other code, or another file of the scene, has made them.
 
     Raises:
         ResultError: a cell is missing or was made by another configuration; the message names it and the command that
             makes it.
     """
-    keys = {(spec.scene.name, spec.method.name, spec.seed): spec.key for spec in experiment.cells()}
     cells: dict[tuple[str, str], list[Cell]] = {
         (scene.name, method.name): [] for scene in experiment.scene for method in experiment.method}
-    for (scene, method, seed), key in keys.items():
-        cell = results.read_cell(scene, method, seed)
-        if cell is None or cell.info.get("key") != key:
+    for spec in experiment.cells():
+        cell = results.read_cell(spec.scene.name, spec.method.name, spec.seed)
+        if cell is None or not (cell.info.get("key") == spec.key
+                                or (any_version and _agrees(cell.config(), plain(spec.config())))):
             state = "missing" if cell is None else "of another configuration"
-            raise ResultError(f"cell {scene} / {method} / seed {seed} in {results.folder} is {state}; "
-                              f"make it with: {_command('run', experiment, results)}")
-        cells[scene, method].append(cell)
+            raise ResultError(f"cell {spec} in {results.folder} is {state}; make it with: {_command('run', experiment, results)}")
+        cells[spec.scene.name, spec.method.name].append(cell)
     return cells
+
+
+def cpus(experiment: Experiment, results: Results) -> list[str]:
+    """The models of CPU that the cells were made on, where they say so."""
+    cells = [cell for group in complete_cells(experiment, results).values() for cell in group]
+    return sorted({cell.info["machine"]["cpu"] for cell in cells if "machine" in cell.info})
+
+
+def _agrees(stored: Any, now: Any) -> bool:
+    """Whether two configurations have the same values; keys that one version has and another has not do not count."""
+    if isinstance(stored, dict) and isinstance(now, dict):
+        return all(_agrees(stored[key], now[key]) for key in stored.keys() & now.keys())
+    return bool(stored == now)
 
 
 def scene_reference(references: Mapping[str, Reference], scene: Scene, results: Results,
@@ -75,49 +86,50 @@ def error_curve(cells: Sequence[Cell], reference: Reference,
     return statistics.common_curve(times, errors)
 
 
-def summarise(experiment: Experiment, results: Results, references: Mapping[str, Reference]) -> dict[str, Any]:
+def summarise(experiment: Experiment, results: Results, references: Mapping[str, Reference],
+              any_version: bool = False) -> dict[str, Any]:
     """The summary of an experiment: ``{"schema_version", "rows"}``, one row a scene and method, in the TOML's order.
 
-    Over seeds, a figure is the median; but `l1_low` and `l1_high` are the 5 and 95 % quantiles, `mean` is the mean
-    with its standard error, `compile_seconds` and `wait_fraction` are the largest, `invalid_pixels` is the sum.  `gain` is the
-    baseline's work-normalised variance over the method's, with its 90 % bootstrap interval.  What has no value (a spread
-    of one seed, the error of an image with NaN or of a scene without reference) is None.
+    Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
+    `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, `invalid_pixels` is the
+    sum.  `gain` is the baseline's work-normalised variance over the method's, with its 90 % bootstrap interval.  What has no
+    value (a spread of one seed, the error of an image with NaN or of a scene without reference) is None.
 
     Args:
-        references: by the name of the scene.
+        references: by the name of the scene; any_version: as for `complete_cells`.
 
     Raises:
         ResultError: a cell or reference is missing.
     """
-    cells, rows = complete_cells(experiment, results), []
+    cells, rows = complete_cells(experiment, results, any_version), []
     for scene in experiment.scene:
         reference = scene_reference(references, scene, results, experiment)
         images = {method.name: [cell.image()["mean"] for cell in cells[scene.name, method.name]] for method in experiment.method}
-        works = {name: _work(cells[scene.name, name], means) for name, means in images.items()}
+        works = {name: work(cells[scene.name, name], means) for name, means in images.items()}
         for name, means in images.items():
             gain = statistics.gain(works[experiment.baseline_name], works[name])
             rows.append(_row(scene.name, name, cells[scene.name, name], means, reference, gain))
     return {"schema_version": SCHEMA_VERSION, "rows": rows}
 
 
-def _work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work:
+def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work:
+    """What the cells of a method (one per seed) show and cost; `images` are theirs."""
     seconds = np.array([cell.info["charged_seconds"] for cell in cells], np.float64)
     return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
 
 
 def _row(scene: str, method: str, cells: Sequence[Cell], images: Sequence[np.ndarray], reference: Reference | None,
          gain: statistics.Interval) -> dict[str, Any]:
-    def errors(metric: Callable[[np.ndarray, np.ndarray], float]) -> list[float]:
-        return [metric(image, reference.mean) if reference is not None else float("nan") for image in images]
-
+    errors = {name: [metric(image, reference.mean) if reference is not None else float("nan") for image in images]
+              for name, metric in metrics.METRICS.items()}
     info = {key: np.array([cell.info[key] for cell in cells], np.float64) for key in (      # null becomes NaN
         "training_passes", "train_seconds", "render_seconds", "compile_seconds", "charged_seconds", "wait_fraction", "spp",
         "records", "bytes_per_record", "particles", "invalid_pixels", "mean", "mean_stderr")}
-    l1 = statistics.median_band(errors(metrics.l1))
-    row = {
+    l1 = statistics.median_band(errors["l1"])
+    return plain({
         "scene": scene, "method": method, "seeds": [cell.seed for cell in cells],
         "l1": l1.median, "l1_low": l1.low, "l1_high": l1.high,
-        "relmse": np.median(errors(metrics.relmse)), "relmse_trimmed": np.median(errors(metrics.relmse_trimmed)),
+        **{name: np.median(values) for name, values in errors.items()},
         "work_normalised_variance": metrics.work_normalised_variance(images, float(np.mean(info["charged_seconds"]))),
         "gain": gain.value, "gain_low": gain.low, "gain_high": gain.high, "mean": np.mean(info["mean"]),
         "mean_stderr": np.sqrt(np.sum(info["mean_stderr"] ** 2)) / len(cells),      # seeds are independent
@@ -127,8 +139,7 @@ def _row(scene: str, method: str, cells: Sequence[Cell], images: Sequence[np.nda
         "spp": _whole(np.median(info["spp"])), "records": _whole(np.median(info["records"])),
         "bytes_per_record": _whole(np.median(info["bytes_per_record"])),
         "particles": _whole(np.median(info["particles"])), "invalid_pixels": _whole(np.sum(info["invalid_pixels"])),
-    }
-    return {key: plain(row[key]) for key in COLUMNS}
+    })
 
 
 def _whole(value: np.floating) -> int:
@@ -139,10 +150,9 @@ def write(summary: dict[str, Any], results: Results) -> None:
     """Write summary.json and table.csv (seeds separated by spaces, empty for no value) into the results folder."""
     results.write_json("summary.json", summary)
     text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS)
-    for row in summary["rows"]:
-        table.writerow([" ".join(map(str, row[key])) if key == "seeds" else row[key] for key in COLUMNS])
+    table = csv.DictWriter(text, list(summary["rows"][0]), lineterminator="\n")
+    table.writeheader()
+    table.writerows({**row, "seeds": " ".join(map(str, row["seeds"]))} for row in summary["rows"])
     results.write_text("table.csv", text.getvalue())
 
 
@@ -196,12 +206,31 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
             if row["invalid_pixels"]:
                 notes.append(f"{label}: {row['invalid_pixels']} pixels are NaN, infinite or negative")
     console = console or Console()
-    terminal, needed = console.width, console.measure(table, options=console.options.update(width=1000)).maximum
-    console.width = max(terminal, needed)       # a narrow terminal wraps the lines; no number is cut off
-    console.print(table)
-    console.width = terminal
+    print_whole(table, console)
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+
+
+def print_metrics(summary: dict[str, Any], console: Console | None = None) -> None:
+    """Print every metric of every row."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, padding=(0, 1), header_style="bold", pad_edge=False)
+    for name in ("scene", "method", *metrics.METRICS):
+        table.add_column(name, justify="left" if name in ("scene", "method") else "right", no_wrap=True)
+    for row in summary["rows"]:
+        table.add_row(Text(row["scene"]), Text(row["method"]), *(number(row[name]) for name in metrics.METRICS))
+    print_whole(table, console or Console())
+
+
+def print_whole(table: Table, console: Console) -> None:
+    """Print a table as wide as it is: a narrow terminal wraps the lines, and no number is cut off."""
+    terminal, needed = console.width, console.measure(table, options=console.options.update(width=1000)).maximum
+    console.width = max(terminal, needed)
+    console.print(table)
+    console.width = terminal
 
 
 def _gain(row: Mapping[str, Any]) -> str:

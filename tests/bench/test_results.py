@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 
 import numpy as np
 import psutil
@@ -218,6 +219,28 @@ def test_the_lock_of_the_dead_is_taken_over(tmp_path, stale):
     with r.locked(tmp_path):
         assert json.loads((tmp_path / "lock").read_text())["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text, age", [(lambda: owner(host="elsewhere", pid=1), r.LEASE), (owner, r.LEASE), (str, r.SIGNING)],
+                         ids=["another host", "hangs here", "killed before it had signed"])
+def test_the_lock_of_the_silent_is_taken_over_and_they_notice(tmp_path, text, age, monkeypatch):
+    path = tmp_path / "lock"
+    path.write_text(text())
+    os.utime(path, (time.time() - age / 2,) * 2)
+    with pytest.raises(LockedError), r.locked(tmp_path):
+        pass
+    monkeypatch.setattr(r, "BEAT", 0)
+    with r.locked(tmp_path / "cell") as alive:
+        os.utime(tmp_path / "cell" / "lock", (0, 0))
+        alive()
+        assert (tmp_path / "cell" / "lock").stat().st_mtime > 0         # a sign of life
+        (tmp_path / "cell" / "lock").write_text(owner(pid=1))           # of the thief
+        with pytest.raises(LockedError, match="was lost to another process"):
+            alive()
+    assert json.loads((tmp_path / "cell" / "lock").read_text())["pid"] == 1
+    os.utime(path, (time.time() - 2 * age,) * 2)
+    with r.locked(tmp_path):
+        assert json.loads(path.read_text())["pid"] == os.getpid()
 
 
 @pytest.mark.parametrize("text", [lambda: owner(host="elsewhere", pid=1), lambda: "not JSON"],

@@ -88,16 +88,16 @@ def test_changed_broken_and_missing_cells_are_redone(experiment, root, monkeypat
     assert [c.info["key"] for c in cells(experiment, root)] == [c.key for c in experiment.cells()]
 
 
-def interrupted_while_tracing() -> RuntimeError:
+def interrupted_while_tracing(by: BaseException) -> RuntimeError:
     error = RuntimeError("dr.while_loop(): encountered an exception (see above).")
-    error.__cause__ = KeyboardInterrupt()
+    error.__cause__ = by
     return error
 
 
 @pytest.mark.parametrize("error, seen", [
-    (KeyboardInterrupt(), KeyboardInterrupt), (interrupted_while_tracing(), KeyboardInterrupt),
-    (OSError(28, "No space left on device", "x"), OSError),
-], ids=["Ctrl-C", "Ctrl-C in a loop", "full disk"])
+    (KeyboardInterrupt(), KeyboardInterrupt), (interrupted_while_tracing(KeyboardInterrupt()), KeyboardInterrupt),
+    (interrupted_while_tracing(SystemExit(-1)), KeyboardInterrupt), (OSError(28, "No space left on device", "x"), OSError),
+], ids=["Ctrl-C", "Ctrl-C in a loop", "preempted in a loop", "full disk"])
 def test_an_interruption_loses_the_cell_in_hand_only(experiment, root, monkeypatch, error, seen):
     monkeypatch.setattr(run, "measure", Counted(fail_at=3, error=error))
     with pytest.raises(seen):

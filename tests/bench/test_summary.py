@@ -12,10 +12,11 @@ from rich.console import Console
 
 from olpm_bench.bench import config, metrics, statistics, summary
 from olpm_bench.bench.results import Reference, ResultError, Results
+from olpm_bench.transport.settings import IntegratorSettings
 
-KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "relmse", "relmse_trimmed", "work_normalised_variance",
-        "gain", "gain_low", "gain_high", "mean", "mean_stderr", "training_passes", "train_seconds", "render_seconds",
-        "compile_seconds", "wait_fraction", "spp", "records", "bytes_per_record", "particles", "invalid_pixels"]
+KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "mape", "smape", "relmse", "relmse_trimmed", "flip", "ssim_error",
+        "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "training_passes", "train_seconds",
+        "render_seconds", "compile_seconds", "wait_fraction", "spp", "records", "bytes_per_record", "particles", "invalid_pixels"]
 ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
 TIMES = [1.0, 4.0, 16.0]
 
@@ -37,7 +38,7 @@ def folder(tmp_path, errors: dict[str, list[float]], seeds: list[int]) -> Simple
                 "mean": 1 + error, "mean_stderr": 0.3}
         trace = [{"seconds": t, "spp": t} for t in TIMES]
         results.write_cell(cell.scene.name, cell.method.name, cell.seed, info, trace,
-                           {"mean": images[-1], "variance": truth, "count": truth[..., 0]}, images)
+                           {"mean": images[-1], "variance": truth, "count": truth[..., 0]}, images, cell.config())
     reference = Reference(truth, truth.copy(), truth, truth, {"spp_a": 1, "spp_b": 1})
     return SimpleNamespace(experiment=experiment, results=results, references={"door_ajar": reference})
 
@@ -73,6 +74,12 @@ def test_figures_over_seeds(known):
     assert row["invalid_pixels"] == 0 and isinstance(row["spp"], int)
 
 
+def test_every_metric_is_a_median_over_seeds(known):
+    row = summarised(known)["rows"][0]
+    assert row["smape"] == pytest.approx(2 * 0.5 / 2.51, rel=1e-6) and row["mape"] == pytest.approx(0.5 / 1.01, rel=1e-6)
+    assert 0 < row["flip"] < 1 and row["ssim_error"] is None        # smaller than the window of SSIM
+
+
 def test_one_seed_has_no_variance_and_json_has_no_nan(tmp_path):
     known = folder(tmp_path, {"Alone": [0.5]}, [0])
     result = summarised(known)
@@ -93,8 +100,8 @@ def without_reference(known, **changes) -> SimpleNamespace:
 def test_a_scene_without_reference_has_no_errors_but_all_the_rest(known):
     rows, expected = summarised(without_reference(known))["rows"], summarised(known)["rows"]
     for row, full in zip(rows, expected, strict=True):
-        errors = ("l1", "l1_low", "l1_high", "relmse", "relmse_trimmed")
-        assert [row[key] for key in errors] == [None] * 5
+        errors = KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1]
+        assert [row[key] for key in errors] == [None] * len(errors)
         assert {k: v for k, v in row.items() if k not in errors} == {k: v for k, v in full.items() if k not in errors}
     assert summary.speed_ups(without_reference(known).experiment, known.results, {}) == {"Fast": {}}
     console = Console(file=io.StringIO(), width=200)
@@ -131,6 +138,26 @@ def test_a_cell_of_another_configuration_does_not_count(known):
     path.write_text(path.read_text().replace(json.loads(path.read_text())["key"], "0123456789abcdef"))
     with pytest.raises(ResultError, match=r"door_ajar / Slow / seed 7 .* is of another configuration"):
         summarised(known)
+
+
+def test_metrics_take_cells_of_other_versions_but_not_of_other_settings(known):
+    """A key that is out of date tells of other code; the settings are in the header of the image."""
+    path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
+    cell = json.loads(path.read_text())
+    path.write_text(json.dumps({**cell, "key": "0123456789abcdef"}))
+    again = summary.summarise(known.experiment, known.results, known.references, any_version=True)
+    path.write_text(json.dumps(cell))
+    assert again == summarised(known)
+    for changes in ({"budget": config.Budget(seconds=17)}, {"integrator": IntegratorSettings(window=0.3)}):
+        with pytest.raises(ResultError, match=r"door_ajar / Slow / seed 4 .* is of another configuration"):
+            summary.summarise(known.experiment.model_copy(update=changes), known.results, known.references, any_version=True)
+
+
+def test_cells_say_on_which_cpus_they_were_made(known):
+    for seed, cpu in ((4, "Abacus 2"), (7, "Abacus 1"), (5, "Abacus 2")):
+        path = known.results.cell_folder("door_ajar", "Slow", seed) / "cell.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "machine": {"cpu": cpu}}))
+    assert summary.cpus(known.experiment, known.results) == ["Abacus 1", "Abacus 2"]
 
 
 def test_a_missing_reference_is_named_with_the_command_that_makes_it(known):
