@@ -178,6 +178,25 @@ def submit(experiment: ExperimentFile, results: ResultsFolder = Path("results"),
 
 
 @command
+def report(source: Annotated[Path, typer.Argument(metavar="RESULTS|EXPERIMENT.toml", show_default=False,
+                                                  help="A folder of results, or the experiment that they are of.")],
+           results: ResultsFolder = Path("results"), scene: Replacements = [], scale: Scale = None) -> None:  # noqa: B006
+    """Print the table and draw the figures and the page of a complete experiment again."""
+    from olpm_bench.bench import environment
+
+    folder = source / "experiment.toml"
+    if source.is_dir() and not folder.is_file():
+        raise InputError(f"{source} is no folder of results: it has no experiment.toml")
+    loaded = _load(folder if source.is_dir() else source, scene, scale)
+    if source.is_dir():
+        loaded, results = loaded.of_results(source.resolve()), source.resolve().parent
+    environment.select_variant()
+    from olpm_bench.bench import run as runner
+
+    runner.report(loaded, results)
+
+
+@command
 def gate(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
          scale: Scale = None) -> None:
     """Put an experiment's claims to the test, after running what is missing; exit code 1 if one fails."""

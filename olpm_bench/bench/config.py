@@ -79,6 +79,8 @@ class Scene(Table):
     max_depth: wins over the integrator's.
     reference: a reference folder, or an EXR of another renderer; by default it is found by the scene's key.  "none": do
         without, and so without errors and speed-ups; variance, gains and means need none.
+    crops: what the figures show enlarged: up to four boxes [x, y, width, height] in pixels, of one shape; by default two where
+        the methods differ most.
     """
     name: str = Field(min_length=1)
     file: Path | None = Field(None, strict=False)
@@ -88,6 +90,7 @@ class Scene(Table):
     height: int = Field(ge=1, le=16384)
     max_depth: int | None = None
     reference: Path | None = Field(None, strict=False)
+    crops: list[list[int]] = Field([], max_length=4)
 
     @field_validator("max_depth")
     @classmethod
@@ -95,6 +98,19 @@ class Scene(Table):
         if value is not None and value < 1 and value != -1:
             raise ValueError("must be >= 1, or -1 for no limit")
         return value
+
+    @model_validator(mode="after")
+    def _crops(self) -> Scene:
+        for crop in self.crops:
+            if len(crop) != 4:
+                raise ValueError(f"crop {crop}: must be [x, y, width, height], in pixels")
+            x, y, width, height = crop
+            if not (0 <= x < x + width <= self.width and 0 <= y < y + height <= self.height):
+                raise ValueError(f"crop {crop}, which is [x, y, width, height]: must be inside the image of {self.width} x "
+                                 f"{self.height} pixels")
+            if width * self.crops[0][3] != height * self.crops[0][2]:
+                raise ValueError("crops: must be of one shape, the same width : height")
+        return self
 
     @property
     def has_reference(self) -> bool:
@@ -368,6 +384,16 @@ class Experiment(Table):
             if name not in known:
                 raise ConfigError(f"no scene {name!r} in {self.path.name}; known: {', '.join(known)}")
         return self.model_copy(update={"scene": [scene for scene in self.scene if not names or scene.name in names]})
+
+    def of_results(self, folder: Path) -> Experiment:
+        """The experiment that was read from its results, under the name of the file that they were made from."""
+        named, (stem, _, scale) = self.model_copy(), folder.name.rpartition("-")
+        original, scaled = (Path("experiments") / f"{name}.toml" for name in (folder.name, stem))
+        if scaled.is_file() and not original.is_file():
+            named._path, named._scale = scaled, scale
+        else:
+            named._path = original if original.is_file() else Path(original.name)
+        return named
 
     def reference_key(self, scene: Scene) -> str:
         return reference_key(scene, self.max_depth(scene))

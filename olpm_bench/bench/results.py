@@ -2,7 +2,8 @@
 
 A result folder (`results/<stem of the TOML>`):
 
-    experiment.toml  env.json  summary.json  table.csv  figure.png  figure.pdf  sheet.png
+    experiment.toml  env.json  summary.json  table.csv  report.html  sheet.png
+    {figure,gains}.{png,pdf,svg}  crops.{png,pdf}
     cells/<scene>/<method>/<seed>/cell.json         written last: with it the cell is complete
                                   trace.jsonl       one line a checkpoint
                                   image.exr         parts mean, variance (of the mean), count

@@ -240,4 +240,15 @@ def report(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> None
         written += ["figure.png", "figure.pdf", "sheet.png"]
     else:
         print("no figure of L1 and no sheet: no scene has a reference")
+    drawn = [name for name in ("figure", "sweep", "gains") if f"{name}.pdf" in written]
+    try:
+        from olpm_bench.report import crops, page
+
+        page.page(results, experiment, found, summarised, drawn)
+        written.append("report.html")
+        if found:
+            crops.crops(results, experiment, found)
+            written += ["crops.pdf", "crops.png"]
+    except ModuleNotFoundError as error:
+        print(f"report.html and crops.pdf need {error.name}: pip install 'olpm-bench[report]'")
     print(f"in {results.folder}: {', '.join(written)}")

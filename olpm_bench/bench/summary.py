@@ -240,17 +240,23 @@ def _gain(row: Mapping[str, Any]) -> str:
 
 def print_speed_ups(found: Mapping[str, Mapping[str, statistics.Interval]], baseline: str,
                     console: Console | None = None) -> None:
-    """Print the speed-ups over `baseline` at equal L1 with 90 % intervals, and their geometric mean over scenes."""
+    """Print `speed_up_lines`."""
     from rich.console import Console
 
     console = console or Console()
+    for line in speed_up_lines(found, baseline):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def speed_up_lines(found: Mapping[str, Mapping[str, statistics.Interval]], baseline: str) -> list[str]:
+    """The speed-ups over `baseline` at equal L1 with 90 % intervals, and their geometric mean over scenes, in words."""
+    lines = []
     for method, scenes in found.items():
-        lines = [f"{scene} / {method}: {_ratio(interval, baseline)}" for scene, interval in scenes.items()]
+        lines += [f"{scene} / {method}: {_ratio(interval, baseline)}" for scene, interval in scenes.items()]
         values = [interval.value for interval in scenes.values()]
         if len(values) > 1 and np.isfinite(values).all() and not any(interval.bound for interval in scenes.values()):
             lines.append(f"{method}: {statistics.geometric_mean(values):.2g}x, geometric mean of {len(values)} scenes")
-        for line in lines:
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return lines
 
 
 def _ratio(interval: statistics.Interval, baseline: str) -> str:

@@ -138,8 +138,8 @@ def draw_gains(rows: Sequence[Mapping[str, Any]], methods: Sequence[str], baseli
     for scene in scenes:
         lines += [scene, *(row for row in rows if row["scene"] == scene)]
     numbers = {i: _gain_label(row) for i, row in enumerate(lines) if not isinstance(row, str)}
-    left = 0.2 + max(*(0.12 + _text_width(row["method"], 8) for row in rows), *(_text_width(scene, 8.5) for scene in scenes))
-    right, bottom, head = 0.2 + max(_text_width(text, 7.5) for text in numbers.values()), 0.42, 0.34 if title else 0.1
+    left = 0.2 + max(*(0.12 + text_width(row["method"], 8) for row in rows), *(text_width(scene, 8.5) for scene in scenes))
+    right, bottom, head = 0.2 + max(text_width(text, 7.5) for text in numbers.values()), 0.42, 0.34 if title else 0.1
     width, inner = left + PANEL[0] + right, ROW * (len(lines) + 0.6)
     caption_ = textwrap.wrap(note, width=int((width - 0.2) * 21))
     foot = 0.06 + 0.115 * len(caption_)
@@ -194,11 +194,10 @@ def style() -> AbstractContextManager[None]:
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write name.png and name.pdf."""
-    with replacing(folder / f"{name}.png") as beside:
-        figure.savefig(beside)
-    with replacing(folder / f"{name}.pdf") as beside:
-        figure.savefig(beside, metadata={"CreationDate": None})
+    """Write name.png, name.pdf and name.svg."""
+    for suffix, metadata in ((".png", None), (".pdf", {"CreationDate": None}), (".svg", {"Date": None})):
+        with replacing(folder / (name + suffix)) as beside:
+            figure.savefig(beside, metadata=metadata)
 
 
 def caption(experiment: Experiment, environment: Mapping[str, Any], faint: bool = False) -> str:
@@ -236,8 +235,8 @@ def draw(panels: Sequence[Panel], title: str = "", note: str = "") -> Figure:
     columns = min(COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
     numbers = [label.get_text() for axes in subplots for label in axes.get_yticklabels()]
-    left = 0.32 + max(_text_width(text, 7.5) for text in numbers)
-    right = 0.28 + 1.03 * max(_text_width(text, size) for panel in panels for text, size in (
+    left = 0.32 + max(text_width(text, 7.5) for text in numbers)
+    right = 0.28 + 1.03 * max(text_width(text, size) for panel in panels for text, size in (
         *((method, 8) for method in panel.curves), *((speed_up_label(interval), 6.5) for interval in panel.speed_ups.values())))
     bottom, top = 0.42, 0.28 if any(panel.title for panel in panels) else 0.1
     width = columns * (left + PANEL[0] + right)
@@ -268,7 +267,7 @@ def speed_up_label(interval: statistics.Interval) -> str:
     return f"{interval.bound}{interval.value:.2g}{TIMES}{spread}"
 
 
-def _text_width(text: str, size: float) -> float:
+def text_width(text: str, size: float) -> float:
     """Width [inch] of a text of `size` points."""
     if not text:
         return 0.0

@@ -5,8 +5,10 @@ where an image is too wide for its column.
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,22 +27,52 @@ if TYPE_CHECKING:
 COLUMN = 480                            # wanted width of a column [pixel]
 GAP = 10
 DPI = 100
-BOXES = ("#ff5a1f", "#29c5ff")          # of the crops, seen on dark and on bright images
+BOXES = ("#ff5a1f", "#29c5ff", "#ffe14d", "#c77dff")       # of the crops, seen on dark and on bright images
 COLOUR_MAP = "magma"
+
+Crop = Sequence[int]                    # x, y, width, height [pixel]
 
 
 @dataclass(frozen=True)
 class Block:
-    """What the sheet shows of one scene; images are (h, w, 3), linear RGB."""
+    """What the figures show of one scene; images are (h, w, 3), linear RGB."""
     scene: str
     reference: np.ndarray
     floor: float | None
     images: dict[str, np.ndarray]       # by method
+    given: Sequence[Crop] = ()          # crops that the experiment's file asks for
+
+    @cached_property
+    def exposure(self) -> float:
+        """Of the reference, for all images."""
+        return tonemap.auto_exposure(self.reference)
+
+    @cached_property
+    def crops(self) -> list[Crop]:
+        """Those given, or two where the methods differ most."""
+        if self.given:
+            return list(self.given)
+        width, height = _crop_size(self.reference)
+        encoded = [tonemap.encode(np.nan_to_num(image), self.exposure) for image in self.images.values()]
+        found = choose_crops(encoded, tonemap.encode(self.reference, self.exposure), width, height)
+        return [(x, y, width, height) for x, y in found]
 
 
 def sheet(results: Results, experiment: Experiment, references: Mapping[str, Reference],
           out: Path | None = None) -> None:
-    """Write sheet.png into `out` (the results folder by default); of each method the seed with the median L1.
+    """Write sheet.png into `out` (the results folder by default).
+
+    Raises:
+        ResultError: as `blocks`.
+    """
+    with figures.style():
+        figure = draw(blocks(results, experiment, references), caption(experiment, read_json(results.folder / "env.json")))
+        with replacing((out or results.folder) / "sheet.png") as beside:
+            figure.savefig(beside, dpi=DPI)
+
+
+def blocks(results: Results, experiment: Experiment, references: Mapping[str, Reference]) -> list[Block]:
+    """What the figures show of each scene: of each method the seed with the median L1.
 
     Scenes without reference are left out; there must be another.
 
@@ -48,7 +80,7 @@ def sheet(results: Results, experiment: Experiment, references: Mapping[str, Ref
         ResultError: a cell or reference is missing; the message names the command that makes it.
     """
     cells = summary.complete_cells(experiment, results)
-    blocks = []
+    found = []
     for scene in experiment.scene:
         reference = summary.scene_reference(references, scene, results, experiment)
         if reference is None:
@@ -56,12 +88,8 @@ def sheet(results: Results, experiment: Experiment, references: Mapping[str, Ref
         images = {}
         for method in (method.name for method in experiment.shown):
             images[method] = _median_image([cell.image()["mean"] for cell in cells[scene.name, method]], reference.mean)
-        blocks.append(Block(scene.name, reference.mean, reference.noise_floor, images))
-    note = _caption(experiment, read_json(results.folder / "env.json"))
-    with figures.style():
-        figure = draw(blocks, note)
-        with replacing((out or results.folder) / "sheet.png") as beside:
-            figure.savefig(beside, dpi=DPI)
+        found.append(Block(scene.name, reference.mean, reference.noise_floor, images, scene.crops))
+    return found
 
 
 def _median_image(images: Sequence[np.ndarray], reference: np.ndarray) -> np.ndarray:
@@ -70,17 +98,33 @@ def _median_image(images: Sequence[np.ndarray], reference: np.ndarray) -> np.nda
     return images[order[(len(images) - 1) // 2]]
 
 
-def _caption(experiment: Experiment, environment: Mapping[str, Any]) -> str:
-    budget = experiment.budget
-    spent = f"{budget.seconds:g} s a method, training included" if budget.seconds else f"{budget.spp} samples per pixel"
+def caption(experiment: Experiment, environment: Mapping[str, Any]) -> str:
+    """What every picture of images must say: budget, seeds, and the machine."""
+    return f"{experiment.title}: {shown(experiment)}. {figures.machine(environment)}"
+
+
+def shown(experiment: Experiment, has_reference: bool = True) -> str:
+    """Budget and seed of the images in words."""
     n = len(experiment.seeds)
-    seeds = f"of {n} seeds the one with the median L1" if n > 1 else "one seed"
-    return f"{experiment.title}: {spent}; {seeds}. {figures.machine(environment)}"
+    seed = "one seed" if n == 1 else f"of {n} seeds the one with the median L1" if has_reference else f"the first of {n} seeds"
+    return f"{budget(experiment)}; {seed}"
+
+
+def budget(experiment: Experiment) -> str:
+    """The budget of a cell in words."""
+    seconds, spp = experiment.budget.seconds, experiment.budget.spp
+    return f"{seconds:g} s a method, training included" if seconds else f"{spp} samples per pixel"
 
 
 def relative_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """|x - r| / (r + 0.01), mean over channels: (h, w)."""
     return np.asarray(np.mean(np.abs(image - reference) / (reference + metrics.EPSILON), axis=-1, dtype=np.float64))
+
+
+def errors_of(block: Block) -> dict[str, tuple[float, float]]:
+    """Method -> L1 and relMSE of the image that is shown."""
+    return {name: (metrics.l1(image, block.reference), metrics.relmse(image, block.reference))
+            for name, image in block.images.items()}
 
 
 def error_scale(errors: Sequence[np.ndarray]) -> float:
@@ -122,14 +166,24 @@ def _window_means(values: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def resize(image: np.ndarray, width: int = COLUMN) -> np.ndarray:
     """(h, w, ...) to about `width`: pixels repeated, or whole blocks averaged (a remainder at far edges is dropped)."""
-    h, w = image.shape[:2]
-    if w <= width * 1.5:
-        k = max(1, round(width / w))
-        return image.repeat(k, axis=0).repeat(k, axis=1)
-    k = round(w / width)
-    h, w = h // k, w // k
+    w = image.shape[1]
+    return _magnified(image, max(1, round(width / w))) if w <= width * 1.5 else _averaged(image, round(w / width))
+
+
+def _magnified(image: np.ndarray, k: int) -> np.ndarray:
+    return image.repeat(k, axis=0).repeat(k, axis=1)
+
+
+def _averaged(image: np.ndarray, k: int) -> np.ndarray:
+    h, w = image.shape[0] // k, image.shape[1] // k
     blocks: np.ndarray = image[:h * k, :w * k].reshape(h, k, w, k, *image.shape[2:]).mean(axis=(1, 3), dtype=np.float64)
     return blocks
+
+
+def _fitted(image: np.ndarray, width: int) -> np.ndarray:
+    """As `resize`, but never wider than `width`."""
+    w = image.shape[1]
+    return _magnified(image, width // w) if w <= width else _averaged(image, math.ceil(w / width))
 
 
 def draw(blocks: Sequence[Block], note: str = "") -> Figure:
@@ -139,7 +193,7 @@ def draw(blocks: Sequence[Block], note: str = "") -> Figure:
     sizes = [resize(block.reference).shape for block in blocks]
     column = max(width for _, width, _ in sizes)
     text = round(0.058 * column)                    # size of the text [pixel]
-    crop_heights = [_crop_geometry(block.reference, width)[2]
+    crop_heights = [max(len(inset) for inset in _insets(block.reference, block.crops, width))
                     for block, (_, width, _) in zip(blocks, sizes, strict=True)]
     left = GAP + (round(1.5 * text) if len(blocks) > 1 else 0)
     head, foot = round(1.9 * text), round(1.6 * text) if note else GAP
@@ -164,45 +218,46 @@ def draw(blocks: Sequence[Block], note: str = "") -> Figure:
     return figure
 
 
-def _crop_geometry(reference: np.ndarray, shown_width: int) -> tuple[int, int, int]:
-    """Width and height of a crop in the image [pixel], and its height on the sheet: two fill the width of an image."""
+def _crop_size(reference: np.ndarray) -> tuple[int, int]:
+    """Width and height of a crop [pixel]: about a fifth of the image, and two fill the width of an image on the sheet."""
     h, w, _ = reference.shape
-    half = (shown_width - GAP) // 2
+    half = (resize(reference).shape[1] - GAP) // 2
     k = max(1, round(half / (0.2 * w)))
-    crop_width = min(w, max(1, half // k))
-    crop_height = min(h, max(1, round(0.7 * crop_width)))
-    return crop_width, crop_height, k * crop_height
+    width = min(w, max(1, half // k))
+    return width, min(h, max(1, round(0.7 * width)))
+
+
+def _insets(image: np.ndarray, crops: Sequence[Crop], shown_width: int) -> list[np.ndarray]:
+    """The crops of an image as they stand on the sheet, side by side under an image."""
+    cell = (shown_width - GAP * (len(crops) - 1)) // len(crops)
+    return [_fitted(image[y:y + height, x:x + width], cell) for x, y, width, height in crops]
 
 
 def _draw_block(axes: Axes, block: Block, columns: Sequence[int], top: int, text: int, caption_row: int) -> None:
     import matplotlib
     from matplotlib.patches import Rectangle
 
-    exposure = tonemap.auto_exposure(block.reference)
     height, width, _ = resize(block.reference).shape
     magnified = width / block.reference.shape[1]
-    crop_width, crop_height, crop_shown = _crop_geometry(block.reference, width)
-    encoded = [tonemap.encode(np.nan_to_num(image), exposure) for image in block.images.values()]
-    crops = choose_crops(encoded, tonemap.encode(block.reference, exposure), crop_width, crop_height)
     errors = {name: relative_error(image, block.reference) for name, image in block.images.items()}
     scale = error_scale(list(errors.values()))
     colours = matplotlib.colormaps[COLOUR_MAP].with_extremes(bad="#" + bytes(tonemap.INVALID).hex())
-    under = {name: (metrics.l1(image, block.reference), metrics.relmse(image, block.reference))
-             for name, image in block.images.items()}
+    under = errors_of(block)
     best = np.nanmin([[*pair] for pair in under.values()], axis=0)
     error_top = top + height + caption_row
     crop_top = error_top + height + GAP
     for x, (name, image) in zip(columns, {"": block.reference, **block.images}.items(), strict=True):
-        _image(axes, x, top, tonemap.srgb(resize(image), exposure))
-        for i, ((cx, cy), box) in enumerate(zip(crops, BOXES, strict=True)):
+        _image(axes, x, top, tonemap.srgb(resize(image), block.exposure))
+        insets = _insets(image, block.crops, width)
+        room = width - sum(inset.shape[1] for inset in insets)          # shared between them
+        at = x
+        for (cx, cy, crop_width, crop_height), inset, box in zip(block.crops, insets, BOXES, strict=False):
             axes.add_patch(Rectangle((x + cx * magnified, top + cy * magnified), crop_width * magnified,
                                      crop_height * magnified, fill=False, edgecolor=box, linewidth=1.8))
-            k = crop_shown // crop_height
-            crop = image[cy:cy + crop_height, cx:cx + crop_width].repeat(k, axis=0).repeat(k, axis=1)
-            at = x if i == 0 else x + width - crop.shape[1]
-            _image(axes, at, crop_top, tonemap.srgb(crop, exposure))
-            axes.add_patch(Rectangle((at + 2, crop_top + 2), crop.shape[1] - 4, crop.shape[0] - 4, fill=False,
+            _image(axes, at, crop_top, tonemap.srgb(inset, block.exposure))
+            axes.add_patch(Rectangle((at + 2, crop_top + 2), inset.shape[1] - 4, inset.shape[0] - 4, fill=False,
                                      edgecolor=box, linewidth=3.2))
+            at += inset.shape[1] + room // max(1, len(insets) - 1)
         middle = top + height + caption_row / 2
         if name:
             _image(axes, x, error_top, colours(resize(errors[name]) / scale)[..., :3])

@@ -1,6 +1,7 @@
 """The commands: what they print, their exit codes, and one line for every expected mistake."""
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -17,6 +18,7 @@ from olpm_bench.bench.results import Reference, read_exr, write_reference
 from olpm_bench.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]
+READERS = all(map(importlib.util.find_spec, ("jinja2", "simpleimageio", "figuregen", "typst")))     # the extra `report`
 TOML = """
 title = "Test"
 seeds = 2
@@ -79,7 +81,7 @@ def test_help_loads_nothing_heavy():
 def test_help_names_every_command():
     result = call("--help")
     assert result.exit_code == 0
-    for name in ("run", "submit", "gate", "reference", "metrics", "compare", "render", "fit", "perf", "list"):
+    for name in ("run", "submit", "gate", "report", "reference", "metrics", "compare", "render", "fit", "perf", "list"):
         assert f"  {name} " in result.output
 
 
@@ -93,7 +95,7 @@ def test_list_shows_scenes_representations_and_experiments(monkeypatch):
 
 # ---------------------------------------------------------------- run
 
-def test_run_prints_the_table_and_writes_the_report(experiment, tmp_path):
+def test_run_prints_the_table_and_writes_the_report_and_report_does_so_again(experiment, tmp_path, monkeypatch):
     result = call("run", experiment, "--results", tmp_path / "results")
     assert result.exit_code == 0, result.output
     assert "Path tracing" in result.stdout and "Roulette" in result.stdout
@@ -102,6 +104,19 @@ def test_run_prints_the_table_and_writes_the_report(experiment, tmp_path):
         assert (folder / name).stat().st_size > 0
     rows = json.loads((folder / "summary.json").read_text())["rows"]
     assert [row["spp"] for row in rows] == [4, 4] and rows[0]["seeds"] == [0, 1]
+    for extra in ("crops.pdf", "report.html"):
+        assert (folder / extra).exists() == READERS
+
+    from olpm_bench.bench import run, summary
+    from olpm_bench.bench.results import Results
+
+    asked = []
+    monkeypatch.setattr(run, "report", lambda *arguments: asked.append(arguments))
+    for arguments in ((folder,), (experiment, "--results", tmp_path / "results")):
+        assert call("report", *arguments).exit_code == 0
+        again, root = asked.pop()
+        assert (root / again.path.stem).resolve() == folder.resolve()
+        assert len(summary.complete_cells(again, Results(folder))) == 2
 
 
 BOTH = TOML.replace("max_depth = 3", 'max_depth = 3\nreference = "none"').replace("[[method]]", """[[scene]]
@@ -126,7 +141,8 @@ def test_scenes_one_by_one_and_without_references(tmp_path):
     assert whole.exit_code == 0, whole.output
     assert "no figure of L1 and no sheet: no scene has a reference" in whole.stdout
     assert {f.name for f in folder.iterdir() if f.is_file()} == {
-        "experiment.toml", "env.json", "summary.json", "table.csv", "gains.png", "gains.pdf"}
+        "experiment.toml", "env.json", "summary.json", "table.csv", "gains.png", "gains.pdf", "gains.svg",
+        *["report.html"] * READERS}
     assert call(*run, "--only-scene", "door_ajar").stdout == whole.stdout      # all is complete: the report is whole
     assert "no scene 'room' in test.toml" in complaint(call(*run, "--only-scene", "room"))
 
@@ -254,6 +270,8 @@ RENDER = ("render", "cornell_box", "--spp", "1", "--out", "x.exr")
     (("run", "good.toml", "--scene", "room=x.xml"), ["no scene 'room'", "known: cornell_box"]),
     (("run", "good.toml", "--results", "newer"), ["schema_version = 7 is newer"]),
     (("reference", "missing.toml"), ["no such file"]),
+    (("report", "newer"), ["newer is no folder of results"]),
+    (("report", "good.toml"), ["cornell_box", "olpm-bench reference good.toml"]),
     ((*RENDER, "--method", "gmm"), ["unknown representation 'gmm'", "gaussian_mixture"]),
     ((*RENDER, "--method", "unguided", "--seconds", "1"), ["give one of --seconds and --spp"]),
     ((*RENDER, "--method", "unguided", "--set", "passes=1"), ["--set passes=1", "KEY=VALUE"]),

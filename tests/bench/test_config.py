@@ -183,6 +183,11 @@ def test_some_scenes_of_an_experiment(tmp_path):
     ("width = 16", 'width = 16\nreference = "None"', ["no such file or folder", '"none" does without']),
     ("passes = 2", "photons = 2.5", ["[training]", "photons", "2.5"]),
     ("width = 16", "width = 16\nparameters = { light_size = 3 }", ["'cornell_box'", "light_size = 3.0", "[0.01, 1.9]"]),
+    ("width = 16", "width = 16\ncrops = [[10, 0, 8, 4]]", ["crop [10, 0, 8, 4]", "must be inside the image of 16 x 12"]),
+    ("width = 16", "width = 16\ncrops = [[0, 0, 0, 4]]", ["crop [0, 0, 0, 4]", "[x, y, width, height]"]),
+    ("width = 16", "width = 16\ncrops = [[0, 0, 8, 4], [0, 0, 4, 4]]", ["one shape, the same width : height"]),
+    ("width = 16", "width = 16\ncrops = [[0, 0, 8]]", ["[[scene]] 1", "crop [0, 0, 8]: must be [x, y, width, height]"]),
+    ("width = 16", "width = 16\ncrops = [0, 0, 8, 4]", ["[[scene]] 1: crops"]),
     ("spp = 8", "spp = ", ["test.toml is not valid TOML", "line 5"]),
 ])
 def test_mistakes_are_named_with_what_is_allowed(tmp_path, old, new, words):
@@ -255,12 +260,13 @@ def test_a_scene_can_be_pointed_elsewhere(tmp_path):
 def test_the_resolved_file_describes_the_same_cells(tmp_path):
     (tmp_path / "room.xml").write_text(XML)
     second = '[[scene]]\nname = "a \\"room\\""\nfile = "room.xml"\nwidth = 8\nheight = 8\noverrides = { resx = 8 }\n'
-    experiment = load(tmp_path, MINIMAL + second)
+    experiment = load(tmp_path, MINIMAL.replace("width = 16", "width = 16\ncrops = [[1, 2, 8, 4]]") + second)
     folder = tmp_path / "results" / "test"
     folder.mkdir(parents=True)
     (folder / "experiment.toml").write_text(experiment.toml(folder))
     again = config.load(folder / "experiment.toml")
     assert [c.key for c in again.cells()] == [c.key for c in experiment.cells()]
+    assert again.scene[0].crops == [[1, 2, 8, 4]] and again.of_results(folder).path == Path("test.toml")
     resolved = tomllib.loads(experiment.toml())
     assert resolved["schema_version"] == 1 and resolved["method"][1]["training"]["neighbours"] == 250
     assert resolved["scene"][0]["parameters"]["light_size"] == 0.5
@@ -279,6 +285,7 @@ def test_the_key_changes_with_all_that_determines_the_cell(tmp_path, old, new):
 @pytest.mark.parametrize("old, new", [
     ('title = "Test"', 'title = "Another"'), ("seeds = 2", "seeds = [0, 7]"), ('"Cosine"', '"Lambert"'),
     ("width = 16", "width = 16\nparameters = { light_size = 0.5 }"), ("passes = 2", "passes = 2\nneighbours = 250"),
+    ("width = 16", "width = 16\ncrops = [[1, 2, 8, 4], [3, 4, 4, 2]]"),
 ])
 def test_the_key_ignores_labels_and_written_out_defaults(tmp_path, old, new):
     assert load(tmp_path, MINIMAL).cells()[1].key == load(tmp_path, MINIMAL.replace(old, new)).cells()[1].key
