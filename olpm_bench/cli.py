@@ -76,17 +76,16 @@ def _interrupt(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def _replacements(texts: list[str] | None) -> dict[str, Path]:
-    """`NAME=PATH` options as a dictionary."""
-    from olpm_bench.bench import config
+def _named_file(text: str, option: str) -> tuple[str, Path]:
+    name, equals, file = text.partition("=")
+    if not equals or not name or not file:
+        raise InputError(f"{option} {text}: must be NAME=PATH")
+    return name, Path(file)
 
-    scenes = {}
-    for text in texts or []:
-        name, equals, file = text.partition("=")
-        if not equals or not name or not file:
-            raise config.ConfigError(f"--scene {text}: must be NAME=PATH")
-        scenes[name] = Path(file)
-    return scenes
+
+def _replacements(texts: list[str] | None) -> dict[str, Path]:
+    """`--scene NAME=PATH` options as a dictionary."""
+    return dict(_named_file(text, "--scene") for text in texts or [])
 
 
 def _load(path: Path, replacements: list[str] | None = None, scale: str | None = None) -> Any:
@@ -307,6 +306,46 @@ def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedd
                            max_depth=max_depth, seed=seed, load_guide=load_guide)
     done = render_one.render(spec, out, save_guide=save_guide, load_guide=load_guide, records_map=records_map)
     print(json.dumps(plain(done), allow_nan=False))
+
+
+@command
+def inspect(run: Annotated[Path, typer.Argument(metavar="RUN", help="An experiment's TOML, or its results folder.",
+                                                show_default=False)],
+            pixel: Annotated[list[str], typer.Option(metavar="X,Y", help="From the top left; can be given again.",
+                                                     show_default=False)],
+            scene: Annotated[str | None, typer.Option(metavar="NAME[=PATH]", help="Which scene, and where its file is.",
+                                                      show_default=False)] = None,
+            seed: Annotated[int | None, typer.Option(min=0, help="Of the training; the experiment's first by default.",
+                                                     show_default=False)] = None,
+            vertex: Annotated[int | None, typer.Option(min=1, help="Of a path from that pixel; the first that is not specular by "
+                                                       "default.", show_default=False)] = None,
+            path_seed: Annotated[int, typer.Option(min=0, help="Of that path.")] = 0,
+            guide: Annotated[list[str], typer.Option(metavar="METHOD=FILE.npz", help="Use this guide; train none.")] = [],  # noqa: B006
+            passes: Annotated[int, typer.Option(min=2, help="Of the truth, 64 paths a bin each.")] = 16,
+            results: ResultsFolder = Path("results")) -> None:
+    """Show what guides have learnt where a pixel looks: their densities, particles and records beside the truth."""
+    from olpm_bench.bench import environment
+
+    name, _, file = (scene or "").partition("=")
+    pixels, guides = [_pixel(text) for text in pixel], dict(_named_file(text, "--guide") for text in guide)
+    if run.is_dir() and not (run / "experiment.toml").is_file():
+        raise InputError(f"{run}: no experiment.toml in it, so it is not the results folder of an experiment")
+    loaded = _load(run / "experiment.toml" if run.is_dir() else run, [f"{name}={file}"] if file else [])
+    environment.select_variant()
+    from olpm_bench.bench import inspect as inspector
+
+    written = inspector.inspect(loaded, run if run.is_dir() else results / run.stem, pixels, scene=name or None, seed=seed,
+                                number=vertex, path_seed=path_seed, passes=passes, guides=guides)
+    for path in written:
+        print(path)
+
+
+def _pixel(text: str) -> tuple[int, int]:
+    try:
+        x, y = map(int, text.split(","))
+        return x, y
+    except ValueError:
+        raise InputError(f"--pixel {text}: must be X,Y, two whole numbers") from None
 
 
 @command

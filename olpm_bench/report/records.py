@@ -5,6 +5,7 @@ Reads what :func:`olpm_bench.transport.view.records_seen` found, renders nothing
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,15 +27,19 @@ COLOUR_MAP = "viridis"
 BAR: dict[str, Any] = {"location": "bottom", "fraction": 0.04, "pad": 0.02, "aspect": 40}
 
 
-def records_map(view: RecordView, image: np.ndarray, trained: int, out: Path) -> None:
+def records_map(view: RecordView, image: np.ndarray, trained: int, out: Path, marks: Sequence[tuple[int, int]] = ()) -> None:
     """Write the picture, PNG or PDF by its suffix.
 
     Args:
         image: the same view, linear RGB (h, w, 3).
         trained: particles from which a record guides paths.
+        marks: pixels (x, y) to mark.
     """
     with figures.style():
         figure = draw(view, image, trained)
+        for axes in figure.axes[:3]:
+            for pixel in marks:
+                mark(axes, pixel)
         with replacing(out) as beside:
             figure.savefig(beside)
 
@@ -46,6 +51,12 @@ def cells(record: np.ndarray, image: np.ndarray) -> np.ndarray:
                        + [NONE])            # index -1
     light = tonemap.encode(image, tonemap.auto_exposure(image)).mean(-1, keepdims=True)
     return palette[record] * (SHADE + (1 - SHADE) * np.nan_to_num(light))
+
+
+def mark(axes: Axes, pixel: tuple[int, int]) -> None:
+    """A cross-hair around a pixel, seen on dark and on bright images."""
+    for colour, width in (("black", 2.4), ("white", 1.1)):
+        axes.plot(*pixel, marker="o", markersize=7, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=width)
 
 
 def draw(view: RecordView, image: np.ndarray, trained: int) -> Figure:

@@ -82,12 +82,12 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         return L, valid, []
 
     @dr.syntax
-    def walk(self, scene, sampler, ray, active, weight=1, camera=None, log=None):
+    def walk(self, scene, sampler, ray, active, ray_weight=1, camera=None, log=None):
         """Trace the path of each ray, and the further ones of a lane; returns the sum of their radiance, whether the last hit
         anything, and their number of vertices.
 
         Args:
-            weight: of the rays.
+            ray_weight: importance that the camera gives each.
             camera: where they come from and further ones are to be had; its pixels are what the roulette looks at.
             log: keeps the vertices.
         """
@@ -102,7 +102,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
 
         ray = mi.Ray3f(ray)
         L = mi.Spectrum(0)                              # radiance carried to the camera
-        beta = mi.Spectrum(weight)                      # throughput of the path so far
+        beta = mi.Spectrum(ray_weight)                  # throughput of the path so far
         eta = mi.Float(1)                               # relative index of refraction along the path
         depth = mi.UInt32(0)                            # segments traced
         path, vertices = mi.UInt32(0), mi.UInt32(0)     # number of the lane's path, and vertices of those before it
@@ -171,8 +171,8 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             # ---------------------- The lane's next path ----------------------
             if dr.hint(paths > 1, mode="scalar"):
                 begins = ~active & (path + 1 < paths)
-                fresh, weight, _ = camera.next(sampler, begins)
-                ray, beta, eta = dr.select(begins, fresh, ray), dr.select(begins, weight, beta), dr.select(begins, 1, eta)
+                fresh, fresh_weight, _ = camera.next(sampler, begins)
+                ray, beta, eta = dr.select(begins, fresh, ray), dr.select(begins, fresh_weight, beta), dr.select(begins, 1, eta)
                 pdf_prev, delta_prev = dr.select(begins, 1, pdf_prev), delta_prev | begins
                 vertices += dr.select(begins, depth, 0)
                 depth, path = dr.select(begins, 0, depth), dr.select(begins, path + 1, path)

@@ -81,7 +81,8 @@ def test_help_loads_nothing_heavy():
 def test_help_names_every_command():
     result = call("--help")
     assert result.exit_code == 0
-    for name in ("run", "submit", "gate", "report", "reference", "metrics", "compare", "render", "fit", "perf", "list"):
+    for name in ("run", "report", "gate", "submit", "reference", "metrics", "compare", "render", "inspect", "fit", "perf",
+                 "list"):
         assert f"  {name} " in result.output
 
 

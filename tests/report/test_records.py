@@ -29,9 +29,12 @@ def test_titles_state_the_shares():
     assert titles[2] == "particles seen; 50.0% of the pixels have 80 or more"
 
 
-def test_the_picture_is_written(tmp_path):
+def test_the_picture_is_written_with_its_marks(tmp_path):
     records.records_map(*_view(), 80, tmp_path / "map.png")
-    assert imread(tmp_path / "map.png").ndim == 3
+    records.records_map(*_view(), 80, tmp_path / "marked.png", marks=[(6, 2)])
+    plain, marked = imread(tmp_path / "map.png"), imread(tmp_path / "marked.png")
+    changed = np.flatnonzero((plain != marked).any(2).any(0))           # columns: around the pixel in all three panels
+    assert 2 < len(np.flatnonzero(np.diff(changed) > 50)) + 1 <= 3 and plain.ndim == 3
 
 
 def test_a_guide_without_records_can_be_shown(tmp_path):
