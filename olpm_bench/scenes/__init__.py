@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 
 from olpm_bench.transport.settings import InputError
 
-EMBEDDED = ("door_ajar", "cornell_box")
+EMBEDDED = ("door_ajar", "living_room", "classroom", "cornell_box")
 
 
 class SceneError(InputError):
@@ -68,6 +68,15 @@ def build(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
         SceneError: no such scene, a parameter it has not, or a value out of its range.
     """
     return _module(name).build(**resolve(name, changes))
+
+
+def check_range(what: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """
+    Raises:
+        SceneError: a value out of its range, or NaN.
+    """
+    if not low <= value <= high:
+        raise SceneError(f"{what} = {value!r}: must be in [{low}, {high}]{unit and f', in {unit}'}")
 
 
 def is_file(name_or_path: str | Path) -> bool:

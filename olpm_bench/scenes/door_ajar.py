@@ -208,48 +208,26 @@ def _furniture() -> dict[str, list[Part]]:
 
 
 def _pictures() -> dict[str, list[Part]]:
-    from olpm_bench.scenes.geometry import box, quad
-
-    def frame(low: tuple[float, float], high: tuple[float, float]) -> list[Part]:
-        (x0, z0), (x1, z1), t = low, high, 0.035
-        y = (DEPTH - 0.03, DEPTH + 0.005)
-        return [box((x0, y[0], z0), (x1, y[1], z0 + t)), box((x0, y[0], z1 - t), (x1, y[1], z1)),
-                box((x0, y[0], z0 + t), (x0 + t, y[1], z1 - t)), box((x1 - t, y[0], z0 + t), (x1, y[1], z1 - t))]
-
-    y = DEPTH - 0.01
+    from olpm_bench.scenes.geometry import frame, quad
+    y, wall = DEPTH - 0.01, (DEPTH - 0.03, DEPTH + 0.005)
     return {
-        "picture_frame": frame((0.12, 1.15), (1.14, 1.9)) + frame((2.48, 1.2), (3.02, 1.9)),
+        "picture_frame": frame((0.12, 1.14), wall, (1.15, 1.9), 0.035) + frame((2.48, 3.02), wall, (1.2, 1.9), 0.035),
         "landscape": [quad((0.155, y, 1.185), (0.95, 0, 0), (0, 0, 0.68))],
         "squares": [quad((2.515, y, 1.235), (0.47, 0, 0), (0, 0, 0.63))],
     }
 
 
 def _materials(floor_roughness: float) -> dict[str, dict[str, Any]]:
-    from olpm_bench.scenes import geometry as g
+    from olpm_bench.scenes import textures as t
+    from olpm_bench.scenes.materials import diffuse, glass, metal, plastic
     rng = np.random.default_rng(1997)
 
-    def colour(value: Any) -> Any:
-        return {"type": "rgb", "value": list(value)} if isinstance(value, tuple) else value
-
-    def two_sided(**bsdf: Any) -> dict[str, Any]:
-        return {"type": "twosided", "bsdf": bsdf}
-
-    def diffuse(reflectance: Any) -> dict[str, Any]:
-        return two_sided(type="diffuse", reflectance=colour(reflectance))
-
-    def plastic(reflectance: Any, alpha: float) -> dict[str, Any]:
-        return two_sided(type="roughplastic", distribution="ggx", alpha=alpha, int_ior=1.5,
-                         diffuse_reflectance=colour(reflectance))
-
-    def metal(material: str, alpha: float) -> dict[str, Any]:
-        return two_sided(type="roughconductor", distribution="ggx", alpha=alpha, material=material)
-
-    parquet = g.boards(rng, 12, 2, 512, (0.24, 0.12, 0.055), (0.6, 0.4, 0.22))
-    wood = g.boards(rng, 5, 1, 256, (0.32, 0.19, 0.1), (0.55, 0.38, 0.22))
-    streaks = g.noise(rng, (128, 256), (4, 64))[..., None] * g.noise(rng, (128, 256), (16, 8))[..., None]
+    parquet = t.boards(rng, 12, 2, 512, (0.24, 0.12, 0.055), (0.6, 0.4, 0.22))
+    wood = t.boards(rng, 5, 1, 256, (0.32, 0.19, 0.1), (0.55, 0.38, 0.22))
+    streaks = t.noise(rng, (128, 256), (4, 64))[..., None] * t.noise(rng, (128, 256), (16, 8))[..., None]
     clay = np.asarray((0.58, 0.27, 0.16)) * (0.75 + 0.4 * streaks)
     return {
-        "floor": plastic(g.texture(parquet, (1.6, 1.6)), floor_roughness),
+        "floor": plastic(t.texture(parquet, (1.6, 1.6)), floor_roughness),
         "plaster": diffuse((0.84, 0.82, 0.78)),
         "corridor": diffuse((0.86, 0.82, 0.75)),
         "frame": plastic((0.7, 0.69, 0.66), 0.2),
@@ -257,14 +235,14 @@ def _materials(floor_roughness: float) -> dict[str, dict[str, Any]]:
         "handle": metal("Cr", 0.2),
         "lamp_frame": metal("Al", 0.3),
         "bulb": diffuse((0.0, 0.0, 0.0)),
-        "table": plastic(g.texture(wood, (0.76, 0.76)), 0.15),
+        "table": plastic(t.texture(wood, (0.76, 0.76)), 0.15),
         "pot": metal("Cu", 0.15),
-        "glass": {"type": "dielectric", "int_ior": 1.5},
-        "clay": diffuse(g.texture(clay)),
+        "glass": glass(),
+        "clay": diffuse(t.texture(clay)),
         "bowl": plastic((0.08, 0.25, 0.3), 0.1),
         "picture_frame": plastic((0.06, 0.04, 0.03), 0.1),
-        "landscape": diffuse(g.texture(g.painted((195, 282), _landscape))),
-        "squares": diffuse(g.texture(g.painted((146, 116), _squares))),
+        "landscape": diffuse(t.texture(t.painted((195, 282), _landscape))),
+        "squares": diffuse(t.texture(t.painted((146, 116), _squares))),
     }
 
 

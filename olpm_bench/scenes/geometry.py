@@ -1,7 +1,6 @@
-"""Meshes and textures of the embedded scenes: boxes, turned bodies, boards and plaster, computed with NumPy."""
+"""Meshes and the sun of the embedded scenes: boxes, turned bodies, sheets, cushions, computed with NumPy."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +47,13 @@ def box(low: Vector, high: Vector) -> Part:
                  quad(lo + y, z, x, True), quad(lo, z, y, True), quad(lo + x, y, z, True)])
 
 
+def frame(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], width: float) -> list[Part]:
+    """Four bars, `width` wide, within the box x, y, z; one looks through along y."""
+    (x0, x1), (y0, y1), (z0, z1), t = x, y, z, width
+    return [box((x0, y0, z0), (x1, y1, z0 + t)), box((x0, y0, z1 - t), (x1, y1, z1)),
+            box((x0, y0, z0 + t), (x0 + t, y1, z1 - t)), box((x1 - t, y0, z0 + t), (x1, y1, z1 - t))]
+
+
 def lathe(profile: list[tuple[float, float]], segments: int = 48, crease: float = 40) -> Part:
     """Body of revolution about z.  Going along `profile` [(radius, z), ...] [m], the outside is on the right.
 
@@ -78,6 +84,43 @@ def lathe(profile: list[tuple[float, float]], segments: int = 48, crease: float 
     return join(parts)
 
 
+def sheet(points: Array) -> Part:
+    """Smooth surface through a grid of points [rows, columns, 3] m, facing columns x rows; uv in [0, 1] along both."""
+    rows, columns = points.shape[:2]
+    normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    v, u = np.mgrid[0:1:rows * 1j, 0:1:columns * 1j]
+    i, j = (x.ravel() for x in np.mgrid[0:rows - 1, 0:columns - 1])
+    a, b, c, d = i * columns + j, i * columns + j + 1, (i + 1) * columns + j + 1, (i + 1) * columns + j
+    return Part(points.reshape(-1, 3), normals.reshape(-1, 3), np.stack([u, v], -1).reshape(-1, 2),
+                np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
+
+
+def cushion(low: Vector, high: Vector, radius: float, puff: float = 0.0, steps: int = 5) -> Part:
+    """Box from its corners with edges rounded by `radius`, its sides bulging by `puff` [m]; uv in metres from its middle."""
+    lo, hi = np.asarray(low, float), np.asarray(high, float)
+    middle, half, edge = (lo + hi) / 2, (hi - lo) / 2, radius * np.linspace(0, 1, steps)
+    parts = []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for side in (-1, 1):
+            s, t = (np.concatenate([edge - half[k], np.linspace(-1, 1, 9)[1:-1] * (half[k] - radius), half[k] - edge[::-1]])
+                    for k in (u, v))
+            p = np.empty((len(t), len(s), 3))
+            p[..., u], p[..., v], p[..., axis] = s[None], t[:, None], side * half[axis]
+            inner = np.clip(p, radius - half, half - radius)
+            outwards = (p - inner) / np.linalg.norm(p - inner, axis=2, keepdims=True)
+            p = inner + radius * outwards
+            bulge = np.cos(np.pi / 2 * p[..., u] / half[u]) * np.cos(np.pi / 2 * p[..., v] / half[v])
+            p[..., axis] += side * puff * bulge
+            if side < 0:
+                p, outwards = p[:, ::-1], outwards[:, ::-1]
+            part = sheet(p)
+            normals = part.normals if puff else outwards.reshape(-1, 3)
+            parts.append(Part(part.vertices + middle, normals, part.vertices[:, [u, v]], part.faces))
+    return join(parts)
+
+
 def join(parts: list[Part]) -> Part:
     """All triangles of `parts`."""
     first = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
@@ -105,42 +148,14 @@ def mesh(name: str, parts: list[Part], bsdf: dict[str, Any], rotation: Array,
     return shape
 
 
-def texture(image: Array, metres: tuple[float, float] = (1, 1)) -> dict[str, Any]:
-    """Bitmap texture of linear RGB values [height, width, 3] (row 0 is the top) that repeats every `metres` of uv."""
-    bitmap = mi.Bitmap(np.ascontiguousarray(image[::-1], np.float32))        # v = 0 is row 0
-    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "repeat",
-            "to_uv": mi.ScalarTransform4f().scale([1 / metres[0], 1 / metres[1], 1])}
+def sunlight(irradiance: Vector, elevation: float, azimuth: float, rotation: Array) -> dict[str, Any]:
+    """Directional light, into rooms whose windows look along +y before `rotation` [3, 3].
 
-
-def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int]) -> Array:
-    """Smooth periodic noise in [0, 1] [shape]: random values on a grid of `cells`, interpolated."""
-    grid = rng.random(cells)
-    index: list[Any] = []
-    for size, count in zip(shape, cells, strict=True):
-        x = np.arange(size) * count / size
-        i = x.astype(int)
-        t = x - i
-        index.append((i, (i + 1) % count, t * t * (3 - 2 * t)))
-    (i0, i1, s), (j0, j1, t) = index
-    rows = grid[i0] * (1 - s)[:, None] + grid[i1] * s[:, None]
-    return rows[:, j0] * (1 - t) + rows[:, j1] * t
-
-
-def boards(rng: np.random.Generator, rows: int, columns: int, pixels: int, dark: Vector,
-           light: Vector) -> Array:
-    """Wooden boards [pixels, pixels, 3]: `rows` of them, each row shifted against the last, with grain and joints."""
-    y, x = np.mgrid[0:pixels, 0:pixels] / pixels
-    row = (y * rows).astype(int)
-    shifted = (x + rng.random(rows)[row]) % 1 * columns
-    tone = rng.random((rows, columns))[row, shifted.astype(int)]
-    grain = noise(rng, (pixels, pixels), (24 * rows, 5 * columns))
-    t = np.clip(0.65 * tone + 0.45 * (grain - 0.3), 0, 1)[..., None]
-    joint = (np.minimum(y * rows % 1, 1 - y * rows % 1) < 0.02) | (np.minimum(shifted % 1, 1 - shifted % 1) < 0.004)
-    return (np.asarray(dark) * (1 - t) + np.asarray(light) * t) * np.where(joint, 0.35, 1.0)[..., None]
-
-
-def painted(pixels: tuple[int, int], colour: Callable[[Array, Array], Array]) -> Array:
-    """`colour(x, y)` in [0, 1]^2, y upwards, sampled at the centres of [height, width] pixels."""
-    h, w = pixels
-    y, x = np.mgrid[0:h, 0:w]
-    return colour((x + 0.5) / w, 1 - (y + 0.5) / h)
+    Args:
+        irradiance: RGB [W/m^2] of a surface that faces the sun.
+        elevation: of the sun above the horizon [degrees].
+        azimuth: between the sun and the windows' normal [degrees]; positive: it shines towards +x.
+    """
+    e, a = np.radians(elevation), np.radians(azimuth)
+    direction = rotation @ (np.cos(e) * np.sin(a), -np.cos(e) * np.cos(a), -np.sin(e))
+    return {"type": "directional", "direction": direction.tolist(), "irradiance": {"type": "rgb", "value": list(irradiance)}}

@@ -43,7 +43,7 @@ def is_standard(scene: mi.Scene, width: int, height: int) -> bool:
 
 
 def test_embedded_scenes():
-    assert list(scenes.names()) == ["door_ajar", "cornell_box"]
+    assert list(scenes.names()) == ["door_ajar", "living_room", "classroom", "cornell_box"]
     assert all(description.endswith(".") for description in scenes.names().values())
     for name in scenes.names():
         assert is_standard(load(name, None, 20, 12, max_depth=3), 20, 12)
@@ -132,7 +132,7 @@ def test_unusable_files(tmp_path: Path, parts: tuple, message: str):
 
 
 @pytest.mark.parametrize("arguments, message", [
-    (("door_ajaar",), "unknown scene 'door_ajaar'; known: door_ajar, cornell_box"),
+    (("door_ajaar",), "unknown scene 'door_ajaar'; known: door_ajar, living_room, classroom, cornell_box"),
     (("nowhere/scene.xml",), "nowhere/scene.xml: there is no such file"),
     (("cornell_box", {"size": 1}), "no parameter 'size'; known: light_size, rotation"),
     (("cornell_box", {"light_size": 3}), "light_size = 3.0: must be in"),
