@@ -368,6 +368,36 @@ def fit(representation: Annotated[str, typer.Option(metavar="NAME", show_default
 
 
 @command
+def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CLASS", show_default=False)],
+          set_: Assignments = [],  # noqa: B006
+          declare: Annotated[list[str], typer.Option(metavar="constant|grows", help="On purpose, it learns nothing, or keeps all "
+                                                     "particles.")] = [],  # noqa: B006
+          only: Annotated[list[str], typer.Option(metavar="CHECK", help="Leave out all other checks.")] = [],  # noqa: B006
+          seed: Annotated[int, typer.Option(min=0)] = 0,
+          repeat: Annotated[int, typer.Option(min=1, help="Run with so many seeds, and count the false alarms.")] = 1,
+          pictures: Annotated[Path, typer.Option(metavar="DIR", help="Where pictures of failures go.")] = Path("results/check"),
+          json_: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False) -> None:
+    """Examine a representation, ours or yours: is it the distribution that it says it is, does it learn, guide unbiased?"""
+    from olpm_bench.bench import environment
+
+    environment.select_variant()
+    from olpm_bench.bench.render_one import settings
+    from olpm_bench.bench.results import plain
+    from olpm_bench.check import examination, suite
+
+    specification = {"type": representation, **settings(set_, ("representation",))["representation"]}
+    checks, subject = suite.named(only), suite.Subject(specification, seed, declare)
+    if repeat > 1:
+        found = examination.campaign(subject, checks, repeat, pictures, quiet=json_)
+    else:
+        found = examination.examine(subject, checks, pictures, quiet=json_)
+    if json_:
+        print(json.dumps(plain(found), allow_nan=False))
+    if not found["passed"]:
+        raise typer.Exit(FAILED)
+
+
+@command
 def perf(scene: Annotated[str, typer.Option(metavar="NAME|FILE.xml", help="What is rendered and trained on.")] = "door_ajar",
          width: Annotated[int, typer.Option(min=1)] = 160, height: Annotated[int, typer.Option(min=1)] = 90,
          passes: Annotated[int, typer.Option(min=3, help="Training passes; timed from the third on.")] = 20) -> None:

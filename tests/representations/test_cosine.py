@@ -3,9 +3,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-from conformance import batch, lobes, vector
 from scipy import stats
 
+from olpm_bench.check.particles import batch, lobes, vector
 from representations.cosine import CosineLobe, cosine_pdf, sample_cosine
 
 

@@ -5,8 +5,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance import uniform_directions, vector
 
+from olpm_bench.check.particles import uniform_directions, vector
 from representations.interface import ParticleBatch
 
 N, RECORDS = 5000, 40

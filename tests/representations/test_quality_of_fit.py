@@ -11,9 +11,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance import vector
 
 import representations
+from olpm_bench.check.particles import vector
 from representations.interface import ParticleBatch
 
 pytestmark = pytest.mark.slow

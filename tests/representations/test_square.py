@@ -4,9 +4,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from conformance import uniform_directions, vector
 from scipy import stats
 
+from olpm_bench.check.particles import uniform_directions, vector
 from representations.square import TO_SOLID_ANGLE, from_hemisphere, to_hemisphere
 
 

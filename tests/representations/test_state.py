@@ -7,9 +7,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance import batch, lobes, states_equal
+from asking import states_equal
 
 import representations
+from olpm_bench.check.particles import batch, lobes
 from representations.state import append, bytes_of, copy_records, from_numpy, to_numpy
 
 

@@ -4,13 +4,9 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import assert_same_expectation, box, furnace, grey, lamp, passes, wall
+from small_scenes import assert_same_expectation, box, grey, lamp, passes, wall
 
 import olpm_bench
-import representations
-from olpm_bench.transport import settings
-from olpm_bench.transport.roulette import PixelEstimate
-from olpm_bench.transport.training import Training
 
 TRAINING = {"passes": 2, "photons": 20_000, "importons": 10_000, "record_radius": 0.08, "camera_passes": 2, "camera_paths": 2**14}
 DEPTH = 8
@@ -88,41 +84,6 @@ def test_every_emitter_trains_and_agrees(name, mitsuba_path):
     guide = olpm_bench.train(scene, "gaussian_mixture", max_depth=DEPTH, **TRAINING)
     assert guide.particles > 1000
     assert_same_expectation(passes(scene, olpm_bench.integrator(guide, max_depth=DEPTH)), passes(scene, mitsuba_path, seed=1000))
-
-
-@pytest.mark.parametrize("representation", representations.names())
-@pytest.mark.parametrize("garbage", [False, True])
-def test_furnace(representation, garbage):
-    """Radiance 1 / (1 - a) everywhere, whatever the guide believes."""
-    albedo = 0.5
-    scene = furnace(albedo)
-    guide = Training(scene, representation, settings.training(**TRAINING), settings.integrator(max_depth=DEPTH))
-    for _ in guide.run():
-        pass
-    guide = guide.radiance
-    if garbage:
-        _teach_garbage(guide)
-    image = passes(scene, olpm_bench.integrator(guide, max_depth=40, rr_depth=8), n=64, spp=64)
-    assert np.isfinite(image).all() and (image >= 0).all()
-    mean, error = image.mean(), image.mean((1, 2, 3)).std(ddof=1) / 8
-    assert abs(mean - 1 / (1 - albedo)) < 4 * error + 1e-4
-    exact = 1 / (1 - albedo) + np.random.default_rng(0).normal(0, 1e-3, image.shape)
-    assert_same_expectation(image, exact)
-
-
-def _teach_garbage(guide):
-    """Particles that have nothing to do with the light, one random direction a record, of wild weights; wild estimates, too."""
-    from representations.interface import ParticleBatch
-    rng = np.random.default_rng(9)
-    n, each = guide.records, 100
-    lobe = rng.normal(size=(n, 1, 3)) + 0.1 * rng.normal(size=(n, each, 3))
-    lobe[..., 2] = np.abs(lobe[..., 2])
-    wo = (lobe / np.linalg.norm(lobe, axis=-1, keepdims=True)).reshape(-1, 3)
-    guide.learn_particles(ParticleBatch.from_arrays(mi.Vector3f(wo.T), mi.Float(rng.lognormal(0, 2, n * each)),
-                                                    mi.UInt32(np.repeat(np.arange(n), each)), n), seed=1)
-    fraction, outgoing = rng.uniform(0.1, 0.9, n), rng.lognormal(0, 2, n)
-    guide.rows = mi.Float(np.stack([np.ones(n), fraction, outgoing, np.zeros(n)], axis=1).ravel())
-    guide.pixels = PixelEstimate(rng.lognormal(0, 1, guide.pixels.luminance.shape))
 
 
 def test_max_depth(mitsuba_path):

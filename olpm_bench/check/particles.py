@@ -1,0 +1,108 @@
+"""The particles that representations are trained on: the states in which a density must be one."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mitsuba as mi
+import numpy as np
+
+from representations.interface import ParticleBatch
+
+Particles = tuple[np.ndarray, np.ndarray]       # of one record in one batch: wo [n, 3], weight [n]
+BATCHES = 3
+COPIES = 3              # records in each condition, with particles of their own
+MILLION = 1_000_000
+EDGE = 1e-4             # elevation z of grazing particles
+
+
+def normalised(v: np.ndarray) -> np.ndarray:
+    return (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def uniform_directions(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Uniform over the hemisphere [n, 3]."""
+    z, phi = 1 - rng.random(n), 2 * np.pi * rng.random(n)
+    r = np.sqrt(1 - z * z)
+    return normalised(np.stack([r * np.cos(phi), r * np.sin(phi), z], -1))
+
+
+def lobes(n: int, rng: np.random.Generator, modes: int = 12) -> np.ndarray:
+    """A few lobes of about 1 to 20 degrees around random directions [n, 3]."""
+    axis, width = uniform_directions(modes, rng), 10 ** rng.uniform(-1.8, -0.5, modes)
+    j = rng.integers(0, modes, n)
+    v = axis[j] + width[j, None] * rng.normal(size=(n, 3))
+    v[:, 2] = np.abs(v[:, 2]) + 1e-3
+    return normalised(v)
+
+
+def collinear(n: int, rng: np.random.Generator) -> np.ndarray:
+    """On one half of a great circle [n, 3]."""
+    axes = normalised(rng.normal(size=(2, 3)))
+    angle = np.pi * rng.random(n)[:, None]
+    v = np.cos(angle) * axes[0] + np.sin(angle) * np.cross(axes[0], np.cross(axes[1], axes[0]))
+    v[:, 2] = np.abs(v[:, 2]) + 1e-6
+    return normalised(v)
+
+
+def grazing(n: int, rng: np.random.Generator) -> np.ndarray:
+    """At the elevation z = `EDGE` [n, 3]."""
+    phi = 2 * np.pi * rng.random(n)
+    r = np.sqrt(1 - EDGE**2)
+    return normalised(np.stack([r * np.cos(phi), r * np.sin(phi), np.full(n, EDGE)], -1))
+
+
+def vector(wo: np.ndarray) -> mi.Vector3f:
+    return mi.Vector3f(*(mi.Float(np.ascontiguousarray(wo[:, i], np.float32)) for i in range(3)))
+
+
+def nothing() -> Particles:
+    return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+
+
+def equal(wo: np.ndarray) -> Particles:
+    """Of weight one each."""
+    return wo, np.ones(len(wo), np.float32)
+
+
+def many(n: int, rng: np.random.Generator) -> Particles:
+    """Of log-normal weights in a few lobes."""
+    return lobes(n, rng), rng.lognormal(size=n).astype(np.float32)
+
+
+# Condition -> the batches of a record in it; `copy` numbers the records of a condition.
+Condition = Callable[[np.random.Generator, int], list[Particles]]
+CONDITIONS: dict[str, Condition] = {
+    "untrained": lambda rng, copy: [],
+    "one particle": lambda rng, copy: [equal(uniform_directions(1, rng))],
+    "ten identical": lambda rng, copy: [equal(np.repeat(uniform_directions(1, rng), 10, axis=0))],
+    "collinear": lambda rng, copy: [equal(collinear(200, rng))],
+    "grazing": lambda rng, copy: [equal(grazing((1, 150, 300)[copy % 3], rng))],
+    "heavy tails": lambda rng, copy: [(lobes(150, rng), (10 ** rng.uniform(-6, 6, 150)).astype(np.float32))],
+    "zero weights": lambda rng, copy: [(lobes(100, rng), (rng.random(100) < 0.5 * (copy % 2)).astype(np.float32))],
+    "few at a time": lambda rng, copy: [many(int(n), rng) for n in rng.integers(0, 60, BATCHES)],
+    "many modes": lambda rng, copy: [many(400, rng)],
+    "on-line": lambda rng, copy: [many(120, rng) for _ in range(BATCHES)],
+    "none at first": lambda rng, copy: [nothing(), nothing(), many(200, rng)],
+    "a million": lambda rng, copy: [many(100, rng), many(MILLION, rng)],
+}
+
+
+def landing(wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where on a disk of radius 0.1 around the record each particle has landed [n, 3], and its distance [n], some infinite."""
+    rng = np.random.default_rng([11, len(wo)])
+    phi, r = 2 * np.pi * rng.random(len(wo)), 0.1 * np.sqrt(rng.random(len(wo)))
+    distance = np.where(rng.random(len(wo)) < 0.8, 10 ** rng.uniform(-1.5, 1.5, len(wo)), np.inf)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), 0.01 * rng.normal(size=len(wo))], -1), distance
+
+
+def batch(particles: list[Particles], parallax: bool = False) -> ParticleBatch:
+    """The particles of all records as Dr.Jit arrays; for `parallax` with places and distances."""
+    if not any(len(weight) for _, weight in particles):
+        return ParticleBatch.empty(len(particles))
+    wo, weight = (np.concatenate([p[i] for p in particles]).astype(np.float32) for i in (0, 1))
+    record = np.repeat(np.arange(len(particles), dtype=np.uint32), [len(p[1]) for p in particles])
+    if not parallax:
+        return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles))
+    at, distance = (np.concatenate([landing(p[0])[i] for p in particles]).astype(np.float32) for i in (0, 1))
+    return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles), mi.Float(distance),
+                                     vector(at))

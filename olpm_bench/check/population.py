@@ -1,0 +1,151 @@
+"""Records in every state of training, and where to ask for their densities: the same for all representations."""
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.stats import qmc
+
+from olpm_bench.check.particles import (
+    BATCHES,
+    CONDITIONS,
+    Particles,
+    batch,
+    landing,
+    many,
+    normalised,
+    nothing,
+    uniform_directions,
+    vector,
+)
+from olpm_bench.check.proposal import Proposals
+from representations.interface import ParticleBatch
+from representations.parallax import aim, inverse
+
+COPIES = 3                          # records in each condition, with particles of their own
+FEW, SAMPLES = 1 << 18, 1 << 14     # samples of a record around at most 10 distinct particles, and of others
+MESH = 1 << 14                      # points of the quadrature, for each record
+PROBES = 1 << 10                    # directions of a record that are looked at one by one
+SPECIAL = [(0, 0, 1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, -1), (0.6, 0, 0.8), (0, 0.6, 0.8), (0.8, 0, -0.6),
+           (0.5, 0.5, 0.5**0.5), (-0.5, 0.5, 0.5**0.5), (1, 0, 1e-7), (1, 0, -1e-7), (0, 1, 1e-4), (-1, -1, 1e-4)]
+
+
+@dataclass(frozen=True)
+class Directions:
+    """To ask about, a lane each, shuffled: no lane has its record's neighbours."""
+    record: np.ndarray      # [n]
+    wo: np.ndarray          # [n, 3]
+    q: np.ndarray           # [n] density of the proposal that chose them [1/sr]; 0 where nothing did
+
+
+class Population:
+    """Records with particles to train on.
+
+    conditions: name of each record's [n_records].
+    batches: one list a batch, with the particles of each record.
+    at: the points from which the records are asked, in their frames [n_records, 3]; then particles have places and distances.
+    """
+
+    def __init__(self, conditions: list[str], batches: list[list[Particles]], seed: int, at: np.ndarray | None = None) -> None:
+        self.conditions, self.batches, self.seed, self.at = conditions, batches, seed, at
+
+    def __len__(self) -> int:
+        return len(self.conditions)
+
+    def of(self, record: int) -> Particles:
+        """All particles of a record."""
+        wo, weight = (np.concatenate([b[record][i] for b in self.batches]) for i in (0, 1))
+        return wo, weight
+
+    def name(self, record: int) -> str:
+        return f"record {record} ({self.conditions[record]})"
+
+    def rng(self, *key: int) -> np.random.Generator:
+        return np.random.default_rng([3, self.seed, *key])
+
+    def arrays(self) -> list[ParticleBatch]:
+        """The batches for Dr.Jit."""
+        made = [batch(particles, self.at is not None) for particles in self.batches]
+        dr.eval(made)
+        return made
+
+    @functools.cached_property
+    def proposals(self) -> Proposals:
+        return Proposals([self._seen(r) for r in range(len(self))], self.rng(1))
+
+    def _seen(self, record: int) -> Particles:
+        """A record's particles from where it is asked."""
+        wo, weight = self.of(record)
+        if self.at is not None and len(wo):
+            parts = [landing(b[record][0]) for b in self.batches]
+            place, distance = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
+            x, y, z, near = aim(tuple(vector(wo)), inverse(mi.Float(distance)), -vector(place))
+            at = mi.Vector3f(*map(float, self.at[record]))
+            wo = normalised(np.stack([np.array(c) for c in aim((x, y, z), near, at)[:3]], -1))
+        return wo, weight
+
+    @functools.cached_property
+    def counts(self) -> np.ndarray:
+        """Samples of each record."""
+        return np.where(self.proposals.count <= 10, FEW, SAMPLES)
+
+    @functools.cached_property
+    def proposed(self) -> Directions:
+        """As many directions of the proposals as there are samples, but for those below the horizon."""
+        rng = self.rng(2)
+        record = np.repeat(np.arange(len(self)), self.counts)
+        return self._above(record, self.proposals.at(record, rng.random((len(record), 3))), rng)
+
+    @functools.cached_property
+    def mesh(self) -> Directions:
+        """Points of a quadrature: an integral is the mean of pdf / q over `MESH` of them, 0 for those that are left out.
+
+        Scrambled Sobol points, shifted for each record.
+        """
+        rng = self.rng(3)
+        u = (qmc.Sobol(3, seed=rng).random(MESH) + rng.random((len(self), 1, 3))) % 1
+        record = np.repeat(np.arange(len(self)), MESH)
+        return self._above(record, self.proposals.at(record, u.reshape(-1, 3)), rng)
+
+    def _above(self, record: np.ndarray, wo: np.ndarray, rng: np.random.Generator) -> Directions:
+        order = rng.permutation(np.flatnonzero(wo[:, 2] > 0))
+        record, wo = record[order], wo[order]
+        return Directions(record, wo, self.proposals.pdf(record, wo))
+
+    @functools.cached_property
+    def probes(self) -> Directions:
+        """All over the sphere, close to the particles, below the horizon, and on the seams of maps."""
+        rng, directions = self.rng(4), []
+        for r in range(len(self)):
+            around = self.proposals.around(r)
+            near = around + 10 ** rng.uniform(-6, -1, (len(around), 1)) * rng.normal(size=around.shape)
+            rest = uniform_directions(PROBES - len(SPECIAL) - len(near), rng)
+            rest[rng.random(len(rest)) < 0.5, 2] *= -1
+            directions.append(normalised(np.concatenate([SPECIAL, near, rest])))
+        n = len(self) * PROBES
+        return Directions(np.repeat(np.arange(len(self)), PROBES), np.concatenate(directions), np.zeros(n))
+
+
+@functools.lru_cache(2)
+def population(seed: int, copies: int = COPIES, million: bool = True) -> Population:
+    """Records in every condition, in an order that puts neighbours into different ones."""
+    rng = np.random.default_rng([1, seed])
+    records = [(name, copy) for copy in range(copies) for name in CONDITIONS
+               if name != "a million" or (million and copy == 0)]
+    batches = [CONDITIONS[name](rng, copy) for name, copy in records]
+    return Population([name for name, _ in records],
+                      [[b[i] if i < len(b) else nothing() for b in batches] for i in range(BATCHES)], seed)
+
+
+@functools.lru_cache(1)
+def population_with_parallax(seed: int) -> Population:
+    """Asked from beside the record, and from so far that light gets out of sight."""
+    rng = np.random.default_rng([2, seed])
+    counts = {"untrained": (0, 0), "one particle": (1, 0), "ten": (10, 0), "one batch": (150, 0), "on-line": (120, 60)}
+    conditions = [f"{name}, {where}" for where in ("beside", "afar") for name in counts]
+    at = np.concatenate([offset * rng.normal(size=(len(counts), 3)) for offset in (0.08, 1.5)])
+    return Population(conditions, [[many(counts[c.partition(",")[0]][i], rng) for c in conditions] for i in (0, 1)], seed,
+                      at.astype(np.float32))

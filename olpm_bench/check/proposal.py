@@ -1,0 +1,78 @@
+"""Densities that reach whatever narrow ones may hide: half uniform, half around the particles at all scales."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from olpm_bench.check.particles import Particles, vector
+
+SMALLEST, LARGEST = 2e-5, 2.0       # chords at which it looks around each particle
+AROUND = 400                        # particles of a record that it looks around, at most: random ones
+LOG_RANGE = float(np.log(LARGEST / SMALLEST))
+
+
+class Proposals:
+    """q(wo) [1/sr] of each record; half of it lies around the record's particles, at times below the horizon.
+
+    Particle i is chosen with probability (1/n + w_i / sum w) / 2.  Around it the chord c is log-uniform: per solid angle
+    1 / (2 pi c^2 ln(LARGEST / SMALLEST)), since a cap within the chord c has the area pi c^2.  Records without particles have
+    q = 1 / (2 pi).
+    """
+
+    def __init__(self, particles: Sequence[Particles], rng: np.random.Generator) -> None:
+        axes, masses = [], []
+        self.complete = np.array([len(weight) <= AROUND for _, weight in particles])      # looks around all of them
+        for wo, weight in particles:
+            if len(wo) > AROUND:
+                kept = rng.choice(len(wo), AROUND, replace=False)
+                wo, weight = wo[kept], weight[kept]
+            axis, index = np.unique(wo, axis=0, return_inverse=True)
+            mass = np.bincount(index.ravel(), weight.astype(np.float64), len(axis))
+            even = np.full(len(axis), 1 / max(len(axis), 1))
+            axes.append(axis)
+            masses.append((even + mass / mass.sum()) / 2 if mass.sum() > 0 else even)
+        self.count = np.array([len(axis) for axis in axes])
+        self.first = np.cumsum(self.count) - self.count
+        self.axis, self.mass = np.concatenate(axes).astype(np.float64), np.concatenate(masses)
+        self.cumulative = np.concatenate([r + np.cumsum(mass) for r, mass in enumerate(masses)])
+
+    def around(self, record: int) -> np.ndarray:
+        """Distinct particles of a record [n, 3]."""
+        return self.axis[self.first[record]:self.first[record] + self.count[record]]
+
+    def at(self, record: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Directions [n, 3] of the records [n] from points of the unit cube [n, 3]."""
+        z, phi = 1 - u[:, 1], 2 * np.pi * u[:, 2]
+        r = np.sqrt(1 - z * z)
+        wo = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+        near = (u[:, 0] < 0.5) & (self.count[record] > 0)
+        if not near.any():
+            return wo
+        some = record[near]
+        chosen = np.searchsorted(self.cumulative, some + 2 * u[near, 0], side="right")
+        axis = self.axis[np.clip(chosen, self.first[some], self.first[some] + self.count[some] - 1)]
+        c, phi = SMALLEST * np.exp(LOG_RANGE * u[near, 1]), phi[near]
+        s = np.cross(axis, np.where(np.abs(axis[:, :1]) < 0.6, [[1, 0, 0]], [[0, 1, 0]]))
+        s /= np.linalg.norm(s, axis=-1, keepdims=True)
+        tangent = s * np.cos(phi)[:, None] + np.cross(axis, s) * np.sin(phi)[:, None]
+        wo[near] = axis * (1 - c * c / 2)[:, None] + tangent * (c * np.sqrt(1 - c * c / 4))[:, None]
+        return wo
+
+    def pdf(self, record: np.ndarray, wo: np.ndarray) -> np.ndarray:
+        """q at directions above the horizon [n]."""
+        first, count = self.first[record], self.count[record]
+        axes, mass = vector(self.axis), mi.Float(self.mass.astype(np.float32))
+        i, end = mi.UInt32(first.astype(np.uint32)), mi.UInt32((first + count).astype(np.uint32))
+        direction = vector(wo)
+
+        def add(i: mi.UInt32, found: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            c2 = dr.squared_norm(dr.gather(mi.Vector3f, axes, i) - direction)
+            inside = (c2 > SMALLEST**2) & (c2 < LARGEST**2)
+            return i + 1, found + dr.select(inside, dr.gather(mi.Float, mass, i) / c2, 0)
+
+        _, found = dr.while_loop((i, dr.zeros(mi.Float, len(wo))), lambda i, _: i < end, add, mode="symbolic")
+        share = np.where(count > 0, 0.5, 0)
+        return (1 - share) / (2 * np.pi) + share / (2 * np.pi * LOG_RANGE) * np.array(found, np.float64)

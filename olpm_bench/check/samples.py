@@ -1,0 +1,124 @@
+"""sample() realises pdf(): it reports that density, and follows it."""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import stats
+
+from olpm_bench.check.density import ROUNDING, direction
+from olpm_bench.check.particles import vector
+from olpm_bench.check.picture import of_record
+from olpm_bench.check.trained import Trained, as_numpy
+from olpm_bench.check.verdict import Failure, PValues, Verdict, exact
+from representations.square import from_hemisphere, to_hemisphere
+
+BINS = 16                   # along each side of the square in the chi-square test
+FEWEST = 50.0               # terms of a bin; bins with fewer are pooled
+LOST = 1e-3                 # share of samples above the horizon whose pdf may be 0: carried over a rim by rounding
+
+
+def report_pdf(trained: Trained) -> Verdict:
+    """The density that sample() returns is the one that pdf() gives for its direction; directions have unit length."""
+    d, people = trained.drawn, trained.people
+    alive, found = d.alive, []
+    with np.errstate(invalid="ignore", divide="ignore"):
+        other = alive & ~(np.abs(d.reported / d.pdf - 1) <= ROUNDING)
+    not_finite = ~np.isfinite(d.wo).all(1) | ~np.isfinite(d.reported)
+    not_unit = alive & (np.abs(np.linalg.norm(d.wo, axis=1) - 1) > 1e-5)
+    for wrong, what in ((not_finite, "not finite"), (d.reported < 0, "negative"),
+                        (alive & (d.wo[:, 2] <= 0), "below the horizon"), (not_unit, "not of unit length"),
+                        (other, "another density")):
+        if wrong.any():
+            i = int(np.flatnonzero(wrong)[0])
+            words = (f"{people.name(d.record[i])}: a sample at {direction(d.wo[i])} reports {d.reported[i]:.5g} 1/sr, pdf() says "
+                     f"{d.pdf[i]:.5g}: {what}; {wrong.sum()} of {len(wrong)} samples")
+            found.append(Failure(wrong.sum(), words, of_record(trained, d.record[i], d.wo[i])))
+    lost = ~alive & (d.wo[:, 2] > 0)
+    share = np.bincount(d.record, lost, len(people)) / people.counts
+    if share.max() > LOST:
+        r = int(share.argmax())
+        found.append(Failure(lost.sum(), f"{people.name(r)}: {share[r]:.2%} of the samples fail, but are not below the horizon",
+                             of_record(trained, r)))
+    return exact(found, "wrong samples", f"{len(alive)} samples, {1 - alive.mean():.2%} fail, {lost.mean():.1e} by rounding")
+
+
+def follow_pdf(trained: Trained, level: float) -> Verdict:
+    """Chi-square of samples against pdf() over the bins of the square, a record each; and sums over all bins.
+
+    Grids miss narrow lobes and plain Monte Carlo integrals of pdf() are heavy-tailed.  So with x from sample(), y from
+    a proposal q and f = pdf(), compare in each bin B the means of 1_B q / (q + f) over x and 1_B f / (q + f) over y:
+    both estimate the integral of f q / (q + f) over B if x follows f, and neither has terms above 1.
+    """
+    people, d, p = trained.people, trained.drawn, trained.people.proposed
+    above = d.alive & (d.wo[:, 2] > 0)
+    record, wo, f_x, f_y = d.record[above], d.wo[above], d.pdf[above], trained.proposed
+    q_x = people.proposals.pdf(record, wo)
+    sampled, variance_x = _binned(q_x / (q_x + f_x), record, wo, people.counts)
+    expected, variance_y = _binned(f_y / (p.q + f_y), p.record, p.wo, people.counts)
+    variance, p_values = variance_x + variance_y, PValues()
+    for r in range(len(people)):
+        chi2, bins, worst = chi_square(sampled[r], expected[r], variance[r], FEWEST / people.counts[r])
+        wo = _centre(worst)
+        words = f"{people.name(r)}: chi-square {chi2:.0f} for {bins} bins, worst around {direction(wo)}"
+        p_values.add(stats.chi2.sf(chi2, bins), words, of_record(trained, r, wo))
+    for condition in dict.fromkeys(people.conditions):
+        some = [c == condition for c in people.conditions]
+        difference, error = (sampled - expected)[some].sum(), np.sqrt(variance[some].sum())
+        words = (f"all records '{condition}': samples and pdf differ by {difference / expected[some].sum():+.2%}, "
+                 f"{abs(difference) / error:.1f} standard deviations")
+        p_values.add(2 * stats.norm.sf(abs(difference) / error), words, of_record(trained, some.index(True)))
+    return p_values.verdict(level, f"{len(q_x) + len(f_y)} directions")
+
+
+def _binned(terms: np.ndarray, record: np.ndarray, wo: np.ndarray, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means over a record's trials of the terms in each bin, and the variances of these means [n_records, BINS^2]."""
+    index, shape, trials = record * BINS**2 + bin_of(wo), (len(trials), BINS**2), trials[:, None]
+    mean, square = (np.bincount(index, t, shape[0] * shape[1]).reshape(shape) / trials for t in (terms, terms**2))
+    return mean, (square - mean**2) / trials
+
+
+def chi_square(sampled: np.ndarray, expected: np.ndarray, variance: np.ndarray, fewest: float) -> tuple[float, int, int]:
+    """Of two estimates a bin; bins with less than `fewest` in both are pooled, so that sums are close to normal.
+
+    Returns:
+        The statistic, its degrees of freedom, and a bin that differs most.
+    """
+    group = np.where(sampled + expected < fewest, 0, np.arange(1, len(sampled) + 1))
+    group = np.unique(group, return_inverse=True)[1]
+    a, b, v = (np.bincount(group, t) for t in (sampled, expected, variance))
+    z2 = (a - b) ** 2 / np.maximum(v, 1e-30)
+    return float(z2.sum()), len(z2), int(np.flatnonzero(group == np.argmax(z2))[0])
+
+
+def bin_of(wo: np.ndarray) -> np.ndarray:
+    """On the square [n], in 0 .. BINS^2 - 1."""
+    x, y = np.clip((np.array(from_hemisphere(vector(wo))) * BINS).astype(int), 0, BINS - 1)
+    return y * BINS + x
+
+
+def _centre(index: int) -> np.ndarray:
+    wo = to_hemisphere(mi.Point2f((index % BINS + 0.5) / BINS, (index // BINS + 0.5) / BINS))
+    return np.array(wo).ravel()
+
+
+def mind_active(trained: Trained, n: int = 4096) -> Verdict:
+    """Lanes that are switched off may hold any record; the others don't notice."""
+    rng, people, r = trained.people.rng(7), trained.people, trained.representation
+    records, on = rng.integers(0, len(people), n), rng.random(n) < 0.5
+    active, record = mi.Bool(on), mi.UInt32(records.astype(np.uint32))
+    masked, at = dr.select(active, record, mi.UInt32(0xFFFFFFFF)), trained.at(records)
+    u, v = mi.Float(rng.random(n).astype(np.float32)), mi.Point2f(rng.random((2, n)).astype(np.float32))
+    wo, pdf = r.sample(trained.state, masked, u, v, active, at)
+    expected, expected_pdf = r.sample(trained.state, record, u, v, True, at)
+    again = r.pdf(trained.state, masked, expected, active, at)
+    found = []
+    for name, a, b in (("the pdf of sample()", pdf, expected_pdf), ("the direction of sample()", wo.z, expected.z),
+                       ("pdf()", again, expected_pdf)):
+        a, b = as_numpy(a, n), as_numpy(b, n)
+        wrong = on & ~np.isclose(a, b, rtol=ROUNDING, equal_nan=True)
+        if wrong.any():
+            i = int(np.flatnonzero(wrong)[0])
+            words = f"{people.name(records[i])}: {name} is {a[i]:.5g} instead of {b[i]:.5g} where other lanes are switched off"
+            found.append(Failure(wrong.sum(), words))
+    return exact(found, "lanes that notice", f"{n} lanes, half of them switched off")

@@ -1,0 +1,145 @@
+"""All checks of a representation, one verdict each; and many runs of them, to see how often they cry wolf.
+
+The checks share one level: a run in which nothing is wrong fails with probability `LEVEL` or less, by Sidak over the checks that
+leave something to chance and over the tests of each.
+"""
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from olpm_bench.check import crowd, density, learning, memory, purity, samples, unbiased
+from olpm_bench.check.population import population, population_with_parallax
+from olpm_bench.check.trained import Trained
+from olpm_bench.check.verdict import Verdict, combined, sidak
+from olpm_bench.transport.settings import InputError
+
+LEVEL = 1e-4            # false alarms of a whole run
+
+DECLARATIONS = {"constant": "learns nothing on purpose", "grows": "keeps all of its particles on purpose"}
+
+
+class Subject:
+    """A representation under examination; its states are trained when a check first asks for them.
+
+    Args:
+        specification: as in a TOML, ``{"type": "gaussian_mixture", "components": 8}``.
+        seed: all random numbers of the checks follow from it.
+        declared: of `DECLARATIONS`, what it does on purpose.
+
+    Raises:
+        RepresentationError, InputError: there is no such representation, or declaration.
+    """
+
+    def __init__(self, specification: dict[str, Any], seed: int = 0, declared: Sequence[str] = ()) -> None:
+        import representations
+
+        for name in declared:
+            if name not in DECLARATIONS:
+                raise InputError(f"--declare {name}: must be one of {', '.join(DECLARATIONS)}")
+        self.specification, self.seed, self.declared = specification, seed, declared
+        self.representation = representations.create(**specification)
+
+    @property
+    def name(self) -> str:
+        return str(self.specification["type"])
+
+    @cached_property
+    def trained(self) -> Trained:
+        return Trained(self.representation, population(self.seed))
+
+    @cached_property
+    def aimed(self) -> Trained:
+        return Trained(self.representation, population_with_parallax(self.seed))
+
+    @cached_property
+    def trials(self) -> purity.Trials:
+        return purity.Trials(self.representation, self.seed)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A sentence of the contract.  `run` takes the subject and the level of this check."""
+    name: str
+    sentence: str
+    run: Callable[[Subject, float], Verdict]
+    statistical: bool = False
+
+
+CHECKS = (
+    Check("density", "pdf is finite, >= 0, and 0 below the horizon", lambda s, _: density.is_valid(s.trained)),
+    Check("integral", "pdf integrates to at most 1: to the share of samples that don't fail",
+          lambda s, level: density.integral(s.trained, level), statistical=True),
+    Check("reported-pdf", "sample returns the density that pdf gives", lambda s, _: samples.report_pdf(s.trained)),
+    Check("samples", "samples follow the pdf", lambda s, level: samples.follow_pdf(s.trained, level), statistical=True),
+    Check("inactive-lanes", "lanes that are switched off change nothing", lambda s, _: samples.mind_active(s.trained)),
+    Check("parallax-density", "as density, asked from beside the record", lambda s, _: density.is_valid(s.aimed)),
+    Check("parallax-reported", "as reported-pdf, asked from beside the record", lambda s, _: samples.report_pdf(s.aimed)),
+    Check("parallax-samples", "as samples, asked from beside the record",
+          lambda s, level: samples.follow_pdf(s.aimed, level), statistical=True),
+    Check("many-records", "none of ten thousands of records is wrong",
+          lambda s, level: crowd.be_many(s.representation, s.seed, level), statistical=True),
+    Check("purity", "same input, same bits; arguments are left alone", lambda s, _: purity.stay_pure(s.trials)),
+    Check("independence", "other records, and the order of records, don't matter",
+          lambda s, level: purity.be_independent(s.trials, level), statistical=True),
+    Check("scale", "the scale of weights doesn't matter", lambda s, _: purity.ignore_scale(s.trials)),
+    Check("nothing-new", "no particles, or of no weight, teach nothing", lambda s, _: purity.ignore_nothing(s.trials)),
+    Check("new-records", "appended records begin fresh, learn, and disturb none", lambda s, _: purity.take_new_records(s.trials)),
+    Check("learning", "held-out directions become more likely with particles",
+          lambda s, level: learning.learn(s.representation, s.seed, "constant" in s.declared, level), statistical=True),
+    Check("memory", "bytes a record don't grow with particles",
+          lambda s, _: memory.stay_bounded(s.representation, s.seed, "grows" in s.declared)),
+    Check("furnace", "guided, a closed box keeps its radiance",
+          lambda s, level: unbiased.keep_the_furnace(s.specification, s.seed, level), statistical=True),
+    Check("image", "guided, an image keeps its expectation",
+          lambda s, level: unbiased.keep_the_image(s.specification, s.seed, level), statistical=True),
+)
+STATISTICAL = sum(check.statistical for check in CHECKS)
+
+
+@dataclass
+class Outcome:
+    check: Check
+    verdict: Verdict
+    seconds: float
+
+
+def named(names: Sequence[str]) -> list[Check]:
+    """The checks of these names, all if there are none.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    known = {check.name: check for check in CHECKS}
+    for name in names:
+        if name not in known:
+            raise InputError(f"unknown check '{name}'; known: {', '.join(known)}")
+    return [known[name] for name in names] or list(CHECKS)
+
+
+def run(subject: Subject, checks: Sequence[Check] = CHECKS, level: float = LEVEL) -> Iterator[Outcome]:
+    """One check after the other; an error in the representation's code is a failure of the check that meets it."""
+    for check in checks:
+        start = time.perf_counter()
+        try:
+            verdict = check.run(subject, sidak(level, STATISTICAL))
+        except (KeyboardInterrupt, MemoryError):
+            raise
+        except Exception as error:              # of other people's code
+            from olpm_bench.bench.progress import is_interrupt, reason
+            if is_interrupt(error):
+                raise
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            words = f"{type(error).__name__}: {reason(error)} ({where.filename}:{where.lineno})"
+            verdict = Verdict(False, "error", None, None, words)
+        yield Outcome(check, verdict, time.perf_counter() - start)
+
+
+def p_value(outcomes: Sequence[Outcome]) -> float:
+    """Of a whole run: below `LEVEL` with probability `LEVEL` or less if nothing is wrong."""
+    p = [o.verdict.p for o in outcomes if o.verdict.p is not None]
+    return combined(min(p), STATISTICAL) if p else 1.0

@@ -1,0 +1,131 @@
+"""`olpm-bench check`: its statistics, what it prints, and its exit codes."""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+from olpm_bench.check import suite
+from olpm_bench.check.particles import CONDITIONS, many, nothing, uniform_directions
+from olpm_bench.check.picture import CELL, over_disk
+from olpm_bench.check.population import population
+from olpm_bench.check.proposal import Proposals
+from olpm_bench.check.verdict import PValues, combined, sidak
+from olpm_bench.cli import app
+
+MUTANTS = Path(__file__).parents[1] / "representations/mutants.py"
+
+
+def call(*arguments: object):
+    return CliRunner().invoke(app, ["check", *map(str, arguments)])
+
+
+# ---------------------------------------------------------------- statistics
+
+def test_sidak_and_its_inverse() -> None:
+    assert sidak(0.05, 1) == pytest.approx(0.05) and sidak(1e-4, 1000) == pytest.approx(1e-7, rel=1e-3)
+    assert combined(sidak(0.01, 37), 37) == pytest.approx(0.01)
+
+
+def test_false_alarms_are_as_frequent_as_stated() -> None:
+    """Of verdicts over 50 uniform p-values each."""
+    rng, alarms, runs, level = np.random.default_rng(0), 0, 2000, 0.05
+    p = []
+    for _ in range(runs):
+        p_values = PValues()
+        for value in rng.random(50):
+            p_values.add(value, "")
+        verdict = p_values.verdict(level)
+        alarms += not verdict.passed
+        p.append(verdict.p)
+    assert stats.binomtest(alarms, runs, level).pvalue > 1e-3
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_a_nan_is_no_p_value() -> None:
+    p_values = PValues()
+    p_values.add(np.nan, "nothing to compare")
+    assert not p_values.verdict(0.01).passed
+
+
+# ---------------------------------------------------------------- proposals and populations
+
+def test_proposals_have_their_density() -> None:
+    """E_q[1 / q] over what lies above the horizon is the hemisphere's solid angle, q at all scales around a particle."""
+    rng = np.random.default_rng(1)
+    proposals, n = Proposals([nothing(), many(5, rng), many(1000, rng)], rng), 1 << 15
+    for record in range(3):
+        index = np.full(n, record)
+        wo = proposals.at(index, rng.random((n, 3)))
+        above = wo[:, 2] > 0
+        ratio = np.where(above, 1 / proposals.pdf(index, wo), 0)
+        z = (ratio.mean() - 2 * np.pi) / (ratio.std() / np.sqrt(n) + 1e-4)
+        assert abs(z) < stats.norm.isf(1e-3 / 6)
+
+
+def test_every_condition_is_in_the_population() -> None:
+    people = population(0)
+    assert set(people.conditions) == set(CONDITIONS)
+    assert max(len(people.of(r)[1]) for r in range(len(people))) > 1_000_000
+    empty = [r for r in range(len(people)) if len(people.of(r)[1]) == 0]
+    assert empty and all(people.conditions[r] in ("untrained", "few at a time") for r in empty)
+    assert all(people.conditions[r] != people.conditions[r + 1] for r in range(len(people) - 1))
+
+
+def test_the_disk_keeps_areas() -> None:
+    """A uniform density is 1 / 2 pi in every cell within the disk."""
+    n = 1 << 18
+    values = over_disk(uniform_directions(n, np.random.default_rng(2)), np.full(n, 1 / n))
+    inner = values[20:44, 20:44]
+    assert np.nansum(values) * CELL == pytest.approx(1, abs=0.02)
+    assert inner.mean() == pytest.approx(1 / (2 * np.pi), rel=5 / np.sqrt(n * CELL * inner.size / (2 * np.pi)))
+
+
+# ---------------------------------------------------------------- the command
+
+def test_json(tmp_path: Path) -> None:
+    result = call("jensen", "--only", "memory", "--only", "scale", "--json", "--pictures", tmp_path)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout, parse_constant=lambda text: pytest.fail(f"{text} in JSON"))
+    assert found["passed"] and [c["name"] for c in found["checks"]] == ["memory", "scale"] and not list(tmp_path.iterdir())
+
+
+def test_a_failure_has_words_a_picture_and_an_exit_code(tmp_path: Path) -> None:
+    result = call(f"{MUTANTS}:ScaleMatters", "--only", "scale", "--only", "purity", "--pictures", tmp_path)
+    assert result.exit_code == 1
+    assert "scale FAILED: record" in result.stdout and "1 of 2 checks FAILED" in result.stdout
+    picture, = tmp_path.rglob("*.png")
+    assert picture.name == "scale.png" and str(picture) in result.stdout.replace("\n", "")
+
+
+def test_a_declaration_is_believed_only_if_it_is_true() -> None:
+    assert call("cosine", "--only", "learning").exit_code == 1
+    assert call("cosine", "--only", "learning", "--declare", "constant").exit_code == 0
+    assert call("jensen", "--only", "learning", "--declare", "constant").exit_code == 1
+    assert call(f"{MUTANTS}:MemoryGrows", "--only", "memory", "--declare", "grows").exit_code == 0
+
+
+def test_a_campaign_counts_alarms(tmp_path: Path) -> None:
+    result = call("jensen", "--only", "learning", "--repeat", 3, "--seed", 5)
+    assert result.exit_code == 0 and "0 of 3 runs raised an alarm" in result.stdout and "seed 7: passed" in result.stdout
+    result = call(f"{MUTANTS}:InPlace", "--only", "purity", "--repeat", 2, "--json", "--pictures", tmp_path)
+    assert result.exit_code == 1 and json.loads(result.stdout)["alarms"] == 2
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["nosuch"], "unknown representation 'nosuch'"), (["jensen", "--only", "nosuch"], "unknown check 'nosuch'; known: density"),
+    (["jensen", "--declare", "nosuch"], "--declare nosuch: must be one of constant, grows"),
+    (["missing.py:Mine"], "there is no such file"), (["jensen", "--set", "representation.bins=3"], "no parameter 'bins'")])
+def test_bad_input(arguments: list[str], words: str) -> None:
+    result = call(*arguments)
+    assert result.exit_code == 2 and words in result.stderr and len(result.stderr.splitlines()) == 1
+
+
+def test_errors_of_other_peoples_code_are_failures() -> None:
+    outcome, = suite.run(suite.Subject({"type": f"{MUTANTS}:FailsToRun"}), suite.named(["purity"]))
+    assert not outcome.verdict.passed and outcome.verdict.worst.startswith("AttributeError: ")
+    assert "mutants.py:" in outcome.verdict.worst

@@ -1,0 +1,276 @@
+"""Representations that are broken on purpose, each in one way, with the check that has to reject it.
+
+Also from the command line: ``olpm-bench check tests/representations/mutants.py:PdfTimesTwoPercent``.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from representations import discrete
+from representations.cosine import CosineLobe, cosine_pdf, sample_cosine
+from representations.gaussian_mixture import GaussianMixture
+from representations.hey import HeyCones
+from representations.interface import ParticleBatch
+from representations.jensen import JensenHistogram, JensenState
+from representations.square import to_hemisphere
+from representations.state import join
+
+# ---------------------------------------------------------------------------------------------- densities
+
+class WrongJacobian(JensenHistogram):
+    """The density of a map to the projected disk, for one that keeps solid angles."""
+    def _density(self, state, record, wo, total, active):
+        return super()._density(state, record, wo, total, active) * 2 * dr.maximum(wo.z, 0)
+
+
+class PdfTimesTwoPercent(JensenHistogram):
+    """2 % too much, in sample() and pdf() alike."""
+    def _density(self, *args):
+        return 1.02 * super()._density(*args)
+
+
+class PdfTimesTen(CosineLobe):
+    """Ten times too much."""
+    def sample(self, *args, **kwargs):
+        wo, pdf = super().sample(*args, **kwargs)
+        return wo, 10 * pdf
+
+    def pdf(self, *args, **kwargs):
+        return 10 * super().pdf(*args, **kwargs)
+
+
+class WeightsUnnormalised(GaussianMixture):
+    """The weights of the mixture sum up to 1.05."""
+    def _lobes(self, *args):
+        lobes = super()._lobes(*args)
+        lobes.weight *= 1.05
+        return lobes
+
+
+class HorizonForgotten(CosineLobe):
+    """|cos| / pi."""
+    def pdf(self, state, record, wo, active=True, at=None):
+        return dr.abs(wo.z) * dr.inv_pi
+
+
+class OneNaN(JensenHistogram):
+    """NaN in one record in 10,000."""
+    def _density(self, state, record, *args):
+        return dr.select(record % 10_000 == 9_999, dr.nan, super()._density(state, record, *args))
+
+
+class NegativeAtTheRim(JensenHistogram):
+    """Below 0 by rounding, close to the horizon."""
+    def _density(self, state, record, wo, total, active):
+        pdf = super()._density(state, record, wo, total, active)
+        return dr.select((wo.z > 0) & (wo.z < 1e-3) & (pdf == 0), -1e-7, pdf)
+
+
+# ---------------------------------------------------------------------------------------------- samples
+
+class DiskForCone(HeyCones):
+    """Uniform on the cone's projected disk, with the density of a cone uniform in solid angle (as the original has it)."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        total = discrete.total(state.cumulative, self.cones, record, active)
+        chosen = discrete.choose(state.cumulative, self.cones, record, sample1 * total, active)
+        cone = self._cone(state, record * self.cones + chosen, active, at)
+        versine = 0.5 * cone.w                          # of the half angle
+        sin_alpha = dr.safe_sqrt(versine * (2 - versine) * sample2.x)
+        sin_phi, cos_phi = dr.sincos(2 * dr.pi * sample2.y)
+        local = mi.Vector3f(sin_alpha * cos_phi, sin_alpha * sin_phi, dr.safe_sqrt(1 - sin_alpha * sin_alpha))
+        wo = dr.select(total > 0, mi.Frame3f(mi.Vector3f(cone.xyz)).to_world(local), sample_cosine(sample2)[0])
+        return wo, self._density(state, record, wo, total, active, at)
+
+
+class SamplesBelowHorizon(CosineLobe):
+    """One sample in a hundred points into the surface, and reports a density."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        wo, pdf = sample_cosine(sample2)
+        wo.z = dr.select(sample1 < 0.01, -wo.z, wo.z)
+        return wo, pdf
+
+
+class NumbersIgnored(CosineLobe):
+    """The same samples, whatever the random numbers."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        return sample_cosine(mi.Point2f(0.3, 0.7) + 0 * sample2)
+
+
+class NumbersShared(CosineLobe):
+    """One random number for two."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        return sample_cosine(mi.Point2f(sample2.x, sample2.x))
+
+
+class LastBinLost(JensenHistogram):
+    """The last bin is never chosen: the mass is searched in one bin too few."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        total = discrete.total(state.cumulative, self.bins, record, active)
+        chosen = dr.minimum(discrete.choose(state.cumulative, self.bins, record, sample1 * total, active), self.bins - 2)
+        corner = mi.Point2f(mi.Float(chosen % self.resolution), mi.Float(chosen // self.resolution))
+        wo = dr.select(total > 0, to_hemisphere((corner + sample2) / self.resolution), sample_cosine(sample2)[0])
+        return wo, self._density(state, record, wo, total, active)
+
+
+class NextBin(JensenHistogram):
+    """pdf() and sample() look into the neighbour's bin."""
+    def _bin(self, wo):
+        return super()._bin(wo) ^ 1
+
+
+class NeighboursPdf(JensenHistogram):
+    """pdf() answers for the record beside."""
+    def pdf(self, state, record, wo, active=True, at=None):
+        return super().pdf(state, (record + 1) % (dr.width(state.mass) // self.bins), wo, active, at)
+
+
+class StaleSamples(JensenHistogram):
+    """Samples follow the state before the last update."""
+    def update(self, state, batch, seed=0):
+        return replace(super().update(state, batch, seed), cumulative=discrete.accumulate(state.mass, self.bins))
+
+
+class ReportsAnother(JensenHistogram):
+    """sample() reports 1 % too much for one sample in a hundred."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        wo, pdf = super().sample(state, record, sample1, sample2, active, at)
+        return wo, dr.select(sample1 > 0.99, 1.01 * pdf, pdf)
+
+
+class FailsAboveHorizon(CosineLobe):
+    """Samples that fail, with directions that look like good ones."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        wo, pdf = sample_cosine(sample2)
+        return wo, dr.select(sample1 < 0.05, 0, 0.95 * pdf)
+
+    def pdf(self, state, record, wo, active=True, at=None):
+        return 0.95 * cosine_pdf(wo)
+
+
+class LanesCounted(CosineLobe):
+    """Lanes that are switched off count."""
+    def pdf(self, state, record, wo, active=True, at=None):
+        some = dr.mean(dr.select(active, mi.Float(1), 0)) if dr.width(active) > 1 else mi.Float(1)
+        return cosine_pdf(wo) * some
+
+
+class ParallaxInSamplesOnly(HeyCones):
+    """pdf() doesn't mind from where it is asked."""
+    def pdf(self, state, record, wo, active=True, at=None):
+        return super().pdf(state, record, wo, active)
+
+
+# ---------------------------------------------------------------------------------------------- updates
+
+class InPlace(JensenHistogram):
+    """update() writes to the state that it was given."""
+    def update(self, state, batch, seed=0):
+        new = super().update(state, batch, seed)
+        dr.eval(new)
+        state.mass, state.cumulative = new.mass, new.cumulative
+        return new
+
+
+class SeedIgnored(HeyCones):
+    """Random numbers of a generator that nobody seeds."""
+    generator = np.random.default_rng()
+
+    def update(self, state, batch, seed=0):
+        return super().update(state, batch, int(self.generator.integers(2**32)))
+
+
+class ScaleMatters(JensenHistogram):
+    """A prior in the unit of the weights."""
+    def update(self, state, batch, seed=0):
+        mass = super().update(state, batch, seed).mass + 1e-3
+        return JensenState(mass, discrete.accumulate(mass, self.bins))
+
+
+class OrderMatters(JensenHistogram):
+    """Records of odd numbers learn from one half of their particles."""
+    def update(self, state, batch, seed=0):
+        weight = dr.select((batch.record % 2 == 0) | (batch.wo.x > 0), batch.weight, 0)
+        return super().update(state, replace(batch, weight=weight), seed)
+
+
+class NeighboursListen(JensenHistogram):
+    """A hundredth of each particle is learnt by the next record."""
+    def update(self, state, batch, seed=0):
+        n = batch.n_records
+        both = ParticleBatch.from_arrays(
+            mi.Vector3f(*(join(c, c) for c in batch.wo)), join(batch.weight, 0.01 * batch.weight),
+            join(batch.record, (batch.record + 1) % n), n) if len(batch) else batch
+        return super().update(state, both, seed)
+
+
+class NothingIsNews(JensenHistogram):
+    """Half is forgotten with each batch, of whatever, and a little is learnt from nothing."""
+    def update(self, state, batch, seed=0):
+        mass = super().update(state, batch, seed).mass
+        mass = mass + 0.01 * dr.repeat(dr.block_sum(mass, self.bins), self.bins)
+        return JensenState(mass, discrete.accumulate(mass, self.bins))
+
+
+class FirstRecordsOnly(JensenHistogram):
+    """Remembers how many records it had at first: those appended get nothing."""
+    first = 0
+
+    def init(self, n_records, seed=0, parallax=False):
+        self.first = self.first or n_records
+        return super().init(n_records, seed, parallax)
+
+    def _density(self, state, record, *args):
+        return dr.select(record < dr.opaque(mi.UInt32, self.first), super()._density(state, record, *args), 0)
+
+
+class LearnsNothing(JensenHistogram):
+    """update() returns what it was given."""
+    def update(self, state, batch, seed=0):
+        return replace(state)
+
+
+class Unlearns(JensenHistogram):
+    """The more particles, the wider: each batch adds the square of its size to every bin."""
+    def update(self, state, batch, seed=0):
+        mass = super().update(state, batch, seed).mass
+        blur = dr.repeat(mi.Float(batch.count()) * 1e-4 * dr.block_sum(mass, self.bins), self.bins)
+        mass = mass + blur
+        return JensenState(mass, discrete.accumulate(mass, self.bins))
+
+
+@dataclass
+class Hoard(JensenState):
+    kept: Any               # weights of all particles, of all batches
+
+
+class MemoryGrows(JensenHistogram):
+    """Keeps all particles, and doesn't say so."""
+    def init(self, n_records, seed=0, parallax=False):
+        return Hoard(**vars(super().init(n_records, seed, parallax)), kept=mi.Float())
+
+    def update(self, state, batch, seed=0):
+        known = super().update(JensenState(state.mass, state.cumulative), batch, seed)
+        return Hoard(**vars(known), kept=join(state.kept, batch.weight))
+
+
+class FailsToRun(CosineLobe):
+    """An AttributeError."""
+    def pdf(self, state, record, wo, active=True, at=None):
+        return cosine_pdf(wo) / state.mass
+
+
+CAUGHT_BY = {
+    WrongJacobian: "samples", PdfTimesTwoPercent: "samples", PdfTimesTen: "integral", WeightsUnnormalised: "samples",
+    HorizonForgotten: "density", OneNaN: "many-records", NegativeAtTheRim: "density",
+    DiskForCone: "samples", SamplesBelowHorizon: "reported-pdf", NumbersIgnored: "samples", NumbersShared: "samples",
+    LastBinLost: "samples", NextBin: "samples", NeighboursPdf: "samples", StaleSamples: "samples", ReportsAnother: "reported-pdf",
+    FailsAboveHorizon: "reported-pdf", LanesCounted: "inactive-lanes", ParallaxInSamplesOnly: "parallax-samples",
+    InPlace: "purity", SeedIgnored: "purity", ScaleMatters: "scale", OrderMatters: "independence",
+    NeighboursListen: "independence", NothingIsNews: "nothing-new", FirstRecordsOnly: "new-records", LearnsNothing: "learning",
+    Unlearns: "learning", MemoryGrows: "memory", FailsToRun: "density",
+}

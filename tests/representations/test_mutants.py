@@ -1,0 +1,22 @@
+"""Every representation that is broken on purpose is rejected, and by the check that should do so."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import mutants
+import pytest
+
+from olpm_bench.check import suite
+
+
+def outcome(mutant: type, check: str) -> suite.Outcome:
+    subject = suite.Subject({"type": f"{Path(mutants.__file__)}:{mutant.__name__}"})
+    found, = suite.run(subject, suite.named([check]))
+    return found
+
+
+@pytest.mark.parametrize(("mutant", "check"), mutants.CAUGHT_BY.items(), ids=lambda v: getattr(v, "__name__", v))
+def test_a_mutant_is_rejected(mutant: type, check: str) -> None:
+    verdict = outcome(mutant, check).verdict
+    assert not verdict.passed
+    assert (verdict.measure == "error") == (mutant is mutants.FailsToRun), verdict.worst
