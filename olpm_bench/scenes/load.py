@@ -75,7 +75,7 @@ def _embedded(name: str, parameters: dict[str, Any] | None, width: int | None, h
     sensor["film"] = {"type": "hdrfilm", **FILM, **size, "rfilter": {"type": "box"}}
     sensor["sampler"] = {"type": "independent"}
     scene["integrator"] = {"type": "path", "max_depth": -1 if max_depth is None else max_depth}
-    return mi.load_dict(scene)
+    return mi.load_dict(scene, optimize=False)          # which would order shapes and emitters anew in every process
 
 
 def _from_file(path: Path, parameters: dict[str, Any], width: int | None, height: int | None,
