@@ -105,7 +105,7 @@ class TrainingSettings:
     neighbours: int = 250
     record_radius: float = 0.02
     shrink: bool = False
-    fraction: float = 0.5
+    fraction: float = 0.4
     learn_fraction: bool = True
     learn_direct: bool = True
     emission: Literal["guided", "emitter"] = "guided"
@@ -137,7 +137,7 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
 
 # The talk's particles, gather and schedule [T, L]: photons and importons only, a fixed fraction.
 _PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "importons": 300_000, "camera_passes": 0,
-          "learn_fraction": False, "weight_window": "flux"}
+          "learn_fraction": False, "weight_window": "flux", "fraction": 0.5}
 
 # What each preset changes of the defaults, which are those of `best`.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
