@@ -212,6 +212,7 @@ representation = {{ type = "gaussian_mixture" }}
 """
 
 
+@pytest.mark.slow
 def test_the_gate_fails_when_a_claim_is_turned_round_and_when_the_guide_learns_garbage(tmp_path):
     """Three calls share the cells of the path tracer; those of the mixture are done anew when its class changes.
 

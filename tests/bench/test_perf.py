@@ -12,6 +12,7 @@ from olpm_bench.bench import perf
 from olpm_bench.cli import app
 
 
+@pytest.mark.slow
 def test_figures_of_the_issue(monkeypatch):
     monkeypatch.setattr(perf, "REPEATS", 1)
     monkeypatch.setattr(perf, "RECORDS", 8)

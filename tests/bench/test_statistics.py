@@ -160,6 +160,7 @@ def test_bootstrap_repeats_and_needs_two_seeds():
     assert single.value == 7 and np.isnan([single.low, single.high]).all()
 
 
+@pytest.mark.slow
 def test_bootstrap_interval_covers_the_truth_as_often_as_it_says():
     """Mean of 25 normal values.  The interval is z std(ddof=0) / sqrt(n), whose coverage is known."""
     n, trials, significance = 25, 300, 1e-4

@@ -79,6 +79,7 @@ def test_no_kernel_is_compiled_after_warm_up(scene, name, changes):
     assert_no_kernel_a_pass(Training(scene, name, many, PATHS, seed=1).run())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gather", ["binned", "nearest"])
 def test_shrinking_records_saturate(scene, gather):
     """Fewer and fewer records are added, none smaller than what fills it, and all surfaces stay guided."""
