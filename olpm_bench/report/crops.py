@@ -45,9 +45,10 @@ def crops(results: Results, experiment: Experiment, references: Mapping[str, Ref
 
 def draw(blocks: Sequence[sheet.Block], note: str, folder: Path) -> None:
     """As `crops`: one row a scene, `note` below."""
-    import figuregen
     import matplotlib
     import typst
+
+    figuregen = _figuregen()
     from figuregen.typst import TypstBackend
 
     class Page(TypstBackend):
@@ -70,10 +71,20 @@ def draw(blocks: Sequence[sheet.Block], note: str, folder: Path) -> None:
             typst.compile(source, output=beside, format="png", ppi=DPI, font_paths=[fonts])
 
 
+def _figuregen() -> Any:
+    """The library, without the style and the LaTeX backend that its import sets for all plots of the process."""
+    import matplotlib
+
+    backend = matplotlib.get_backend()
+    with matplotlib.rc_context():
+        import figuregen
+    matplotlib.use(backend)
+    return figuregen
+
+
 def _grids(block: sheet.Block, title: str) -> list[Any]:
     """The two grids of a scene: the reference with boxes, and the insets, a column for the reference and each method."""
-    import figuregen
-
+    figuregen = _figuregen()
     images = {"Reference": block.reference, **block.images}
     whole, insets = figuregen.Grid(1, 1), figuregen.Grid(len(block.crops), len(images))
     whole[0, 0].image = _png(block.reference, block.exposure)
@@ -95,9 +106,7 @@ def _grids(block: sheet.Block, title: str) -> list[Any]:
 
 
 def _png(image: np.ndarray, exposure: float) -> Any:
-    import figuregen
-
-    return figuregen.PNG(tonemap.srgb(image, exposure).astype(np.float32) / 255)
+    return _figuregen().PNG(tonemap.srgb(image, exposure).astype(np.float32) / 255)
 
 
 def _fit_text(page: Any, row: Sequence[Any]) -> None:

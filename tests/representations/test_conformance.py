@@ -19,7 +19,11 @@ def subject(request: pytest.FixtureRequest) -> suite.Subject:
     return suite.Subject({"type": request.param}, declared=DECLARED.get(request.param, ()))
 
 
-@pytest.mark.parametrize("check", suite.CHECKS, ids=lambda c: c.name)
+RENDERS = ("furnace", "image")          # slow ones
+
+
+@pytest.mark.parametrize("check", [pytest.param(c, marks=[pytest.mark.slow] * (c.name in RENDERS)) for c in suite.CHECKS],
+                         ids=lambda c: c.name)
 def test_conformance(subject: suite.Subject, check: suite.Check) -> None:
     outcome, = suite.run(subject, [check])
     assert outcome.verdict.passed, outcome.verdict.worst

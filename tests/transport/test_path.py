@@ -50,7 +50,10 @@ def mitsuba_path():
     return mi.load_dict({"type": "path", "max_depth": DEPTH})
 
 
-@pytest.mark.parametrize("name", BSDFS)
+QUICK = ("glossy", "rough glass", "masked", "principled")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in BSDFS])
 def test_guided_and_unguided_agree_with_mitsuba(name, mitsuba_path):
     scene = _scene(BSDFS[name]())
     expected = passes(scene, mitsuba_path, seed=1000)
