@@ -187,7 +187,7 @@ def _last_pass(scene: mi.Scene, spec: CellSpec, guide: Guide, training: Training
         paths = CameraPaths(pixels, spp, max_depth, integrator.paths_a_lane(sensor, spp))
         dr.eval(integrator.render_paths(scene, sensor, seed, spp, paths))
         paths.propagate()
-        if len(lessons := paths.lessons()):
+        if len(lessons := paths.lessons(paths.particles().place)):
             found["camera paths"] = binned(guide.cache, lessons, s.neighbours, s.parallax)
     return found
 

@@ -148,9 +148,8 @@ class CameraPaths:
         """All vertices, path by path, as particles that carry the radiance that arrived (`propagate` comes first)."""
         return Particles(self.position, self.direction, self.normal, places(self.count, self.rows), self.n_paths)
 
-    def lessons(self) -> Particles:
-        """The same with what next-event estimation found, still path by path: all that there is to learn radiance from."""
-        vertex = places(self.count, self.rows)
+    def lessons(self, vertex: mi.UInt32) -> Particles:
+        """The vertices at these places with what next-event estimation found at each: all that radiance is learnt from."""
         either = dr.arange(mi.UInt32, 2 * len(vertex))
         place = dr.gather(mi.UInt32, vertex, either // 2) + either % 2 * dr.opaque(mi.UInt32, self.rows * self.n_paths)
         place = dr.gather(mi.UInt32, place, dr.compress(dr.gather(mi.Float, self.position, 4 * place + 3) > 0))

@@ -71,8 +71,8 @@ class TrainingSettings:
     photons, importons: paths emitted in a particle pass.
     camera_passes: at most so many passes of camera paths, which render the image and teach the guide.
     camera_paths: paths of such a pass: as many samples a pixel, rounded to a power of two, as come nearest; at least one.
-    share: of a budget in seconds, after which training ends; 1 trains all passes whatever they take.  "auto": when learning on
-        is expected to cost more variance than it saves, at most half of the budget; see `bench.run.end_of_training`.
+    share: of a budget in seconds, after which training ends; 1: with its last pass, or with the budget.  "auto": when learning
+        on is expected to cost more variance than it saves, at most half of the budget; see `bench.cell.end_of_training`.
     blend: let the images of camera passes of the second half of training into the result, sample for sample.
     while_rendering: go on learning from the paths of every rendering pass.
     gather: "binned": the particles whose look-up gives the record, at most `neighbours` of them;

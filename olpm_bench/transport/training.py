@@ -261,7 +261,7 @@ class Training:
                 p, _, _, _, n = vertices.read(vertices.place)
                 guide.grow(p, n, mi.Bool(True), self._next_seed())
             with _Seconds(statistics, "gather"):
-                batch = binned(guide.cache, paths.lessons(), self.settings.neighbours, self.settings.parallax)
+                batch = binned(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
             with _Seconds(statistics, "update"):
                 guide.learn_camera(batch, *paths.returned(place), offset, self._next_seed())

@@ -9,30 +9,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from small_experiment import TOML
 
 from olpm_bench.bench import cell, config
 from olpm_bench.bench.cell import CellFailedError, WarmUp
 from olpm_bench.bench.clock import Lap
 from olpm_bench.bench.config import Experiment
 from olpm_bench.transport.training import PassStatistics
-
-TOML = """
-title = "Test"
-seeds = 2
-[budget]
-spp = 11
-checkpoints = 3
-[[scene]]
-name = "cornell_box"
-width = 16
-height = 12
-max_depth = 4
-[[method]]
-name = "Path tracing"
-[[method]]
-name = "Roulette"
-integrator = { roulette = "throughput" }
-"""
 
 
 @pytest.fixture

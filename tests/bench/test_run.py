@@ -9,29 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_experiment import TOML
 
 from olpm_bench.bench import config, run
 from olpm_bench.bench.cell import CellFailedError
 from olpm_bench.bench.config import Experiment
 from olpm_bench.bench.results import Reference, ResultError, Results, locked, write_reference
-
-TOML = """
-title = "Test"
-seeds = 2
-[budget]
-spp = 11
-checkpoints = 3
-[[scene]]
-name = "cornell_box"
-width = 16
-height = 12
-max_depth = 4
-[[method]]
-name = "Path tracing"
-[[method]]
-name = "Roulette"
-integrator = { roulette = "throughput" }
-"""
 
 
 @pytest.fixture

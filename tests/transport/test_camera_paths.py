@@ -84,9 +84,10 @@ def test_direct_light_that_the_guide_learns():
         paths = CameraPaths(training.pixels, 64, DEPTH)
         dr.eval(training.integrator.render_paths(scene, training.sensor, 7, 64, paths))
         paths.propagate()
-        lessons = paths.lessons()
-        learnt[direct] = lessons.read(lessons.place)[1].numpy().sum() / len(paths.particles())
-        assert (len(lessons) > len(paths.particles())) == direct
+        vertices = paths.particles()
+        lessons = paths.lessons(vertices.place)
+        learnt[direct] = lessons.read(lessons.place)[1].numpy().sum() / len(vertices)
+        assert (len(lessons) > len(vertices)) == direct
     assert learnt[True] == pytest.approx(2 * np.pi * ((1 - 1 / 16) / 2 - 3 / 16), rel=0.02)
     assert learnt[False] > 0
 
