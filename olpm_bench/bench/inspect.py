@@ -169,7 +169,7 @@ def _last_pass(scene: mi.Scene, spec: CellSpec, guide: Guide, training: Training
     assert s is not None
     seed = cells.WARM_UP_SEED + spec.seed
     if training is not None and s.passes:
-        importance, mode = training.importance if s.schedule == "interleaved" else None, mi.TransportMode.Importance
+        importance, mode = training.importance if s.schedule != "single_batch" else None, mi.TransportMode.Importance
         n, sampler = s.photons * (1 if importance else s.passes), mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, seed), n)
         rays = training.emission.emit(sampler) if training.emission is not None else emit_photons(scene, sampler)

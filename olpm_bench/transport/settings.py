@@ -66,7 +66,8 @@ class TrainingSettings:
     """How a guide is trained: first `passes` passes of particles, then `camera_passes` passes of camera paths.
 
     schedule: "interleaved" alternates importons and photons for `passes` passes, each with one on-line update;
-        "single_batch" traces passes * photons photons without guiding and fits once (slides 51-52).
+        "importons_first" traces `passes` passes of unguided importons, then as many of photons that they guide (Peter and
+        Pietrek 1998); "single_batch" traces passes * photons photons without guiding and fits once (slides 51-52).
     passes: particle passes; without these and camera passes the guide stays untrained, which is plain BSDF sampling.
     photons, importons: paths emitted in a particle pass.
     camera_passes: at most so many passes of camera paths, which render the image and teach the guide.
@@ -92,7 +93,7 @@ class TrainingSettings:
     parallax: representations re-aim at what they have learnt from the point where they are asked, not from their record's.
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-    schedule: Literal["interleaved", "single_batch"] = "interleaved"
+    schedule: Literal["interleaved", "importons_first", "single_batch"] = "interleaved"
     passes: int = 2
     photons: int = 300_000
     importons: int = 100_000
@@ -115,7 +116,7 @@ class TrainingSettings:
 
     def __post_init__(self) -> None:
         _require_types(self, "share")
-        _require_choice(self, "schedule", "interleaved", "single_batch")
+        _require_choice(self, "schedule", "interleaved", "importons_first", "single_batch")
         _require_choice(self, "gather", "binned", "nearest")
         _require_choice(self, "emission", "guided", "emitter")
         _require_choice(self, "weight_window", "flux", "contribution")

@@ -151,7 +151,7 @@ class Training:
         self.luminance: np.ndarray | None = None        # of the mean of all camera passes so far (h, w), ...
         self.spp = 0                                    # ... and their samples a pixel
         self.emission = EmissionGuide(scene, bounds, settings.emission_fraction) if (
-            settings.emission == "guided" and settings.schedule == "interleaved" and distant_lights(scene)) else None
+            settings.emission == "guided" and settings.schedule != "single_batch" and distant_lights(scene)) else None
         self.regions = regions
         self.sensor = sensor or scene.sensors()[0]
         film = self.sensor.film()
@@ -159,21 +159,22 @@ class Training:
         self.camera_spp = 1 << max(0, round(np.log2(settings.camera_paths / self.pixels)))      # of a camera pass
         self.sampler = mi.load_dict({"type": "independent"})
         self.draws = 0                      # seeds used so far
+        particle_passes = {"interleaved": [self._interleaved] * settings.passes,
+                           "importons_first": [self._importons] * settings.passes + [self._photons] * settings.passes,
+                           "single_batch": [self._single_batch] * min(settings.passes, 1)}[settings.schedule]
+        self.steps = particle_passes + [self._camera_pass] * settings.camera_passes
         # Of photons and importons: hits a particle leaves in their first pass, and what the window is told for as many.
         self.hits: dict[mi.TransportMode, tuple[float, float]] = {}
 
     def run(self) -> Iterator[PassStatistics]:
         """Train as the settings say, one pass at each step.  Who stops early has a guide as good as the passes done."""
-        particle_pass = {"interleaved": self._interleaved, "single_batch": self._single_batch}[self.settings.schedule]
-        for index in range(self.passes):
-            step = particle_pass if index < self.passes - self.settings.camera_passes else self._camera_pass
+        for index, step in enumerate(self.steps):
             yield step(PassStatistics(index, self.passes))
 
     @property
     def passes(self) -> int:
         """Of particles and of camera paths together."""
-        particles = min(self.settings.passes, 1) if self.settings.schedule == "single_batch" else self.settings.passes
-        return particles + self.settings.camera_passes
+        return len(self.steps)
 
     def camera_pass(self) -> PassStatistics:
         """One more pass of camera paths, after or beside those of `run`."""
@@ -181,25 +182,31 @@ class Training:
 
     def _interleaved(self, statistics: PassStatistics) -> PassStatistics:
         """Importons, then photons, each guided by what the other has learnt so far."""
-        s = self.settings
-        if s.importons:
-            importons = self._trace(partial(emit_importons, self.sensor), s.importons, self.radiance, self.importance,
+        self._importons(statistics)
+        return self._photons(statistics)
+
+    def _importons(self, statistics: PassStatistics) -> PassStatistics:
+        if n := self.settings.importons:
+            importons = self._trace(partial(emit_importons, self.sensor), n, self.radiance, self.importance,
                                     mi.TransportMode.Radiance, statistics)
-            self._learn(self.importance, importons, s.importons, statistics)
+            self._learn(self.importance, importons, n, statistics)
             if self.emission is not None and importons.departures is not None:
                 with _Seconds(statistics, "update"):
                     self.emission.learn(importons.departures, self._next_seed())
                 if not self.emission.learnt:
                     statistics.warnings.append("too few importons leave towards the lights at infinity: their photons start as "
                                                "the emitters sample them")
-            statistics.importons = s.importons
-        return self._photons(s.photons, self.importance, statistics)
+            statistics.importons = n
+        return statistics
+
+    def _photons(self, statistics: PassStatistics) -> PassStatistics:
+        return self._learn_photons(self.settings.photons, self.importance, statistics)
 
     def _single_batch(self, statistics: PassStatistics) -> PassStatistics:
         """All photons at once, unguided, and one fit [T 51-52]."""
-        return self._photons(self.settings.photons * self.settings.passes, None, statistics)
+        return self._learn_photons(self.settings.photons * self.settings.passes, None, statistics)
 
-    def _photons(self, n: int, importance: Guide | None, statistics: PassStatistics) -> PassStatistics:
+    def _learn_photons(self, n: int, importance: Guide | None, statistics: PassStatistics) -> PassStatistics:
         emit = self.emission.emit if self.emission is not None else partial(emit_photons, self.scene)
         photons = self._trace(emit, n, importance, self.radiance, mi.TransportMode.Importance, statistics)
         statistics.kept = self._learn(self.radiance, photons, n, statistics)

@@ -82,6 +82,7 @@ def test_who_guides_whom_is_compared_with_as_many_particles(tmp_path, scale):
     trained = [experiment.training_of(method) for method in experiment.method[1:]]
     assert len({t.passes * (t.photons + t.importons) for t in trained}) == 1
     assert [t.importons > 0 for t in trained] == [False, True, True] and {t.share for t in trained} == {1}
+    assert [t.schedule for t in trained] == ["interleaved", "importons_first", "interleaved"]
 
 
 def test_the_committed_reference_keeps_its_key():

@@ -114,6 +114,15 @@ def test_single_batch_is_one_unguided_fit(scene):
     assert guide.count.numpy().max() <= SMALL.neighbours
 
 
+def test_importons_first_guide_photons_that_teach_them_nothing(scene):
+    first = settings.with_changes(PARTICLES, {"schedule": "importons_first", "passes": 2})
+    training = Training(scene, "gaussian_mixture", first, PATHS)
+    passes = [(p.importons, p.photons, training.radiance.records > 0, training.importance.particles) for p in training.run()]
+    n, known = first.importons, [p[3] for p in passes]
+    assert [p[:3] for p in passes] == [(n, 0, False), (n, 0, False), (0, first.photons, True), (0, first.photons, True)]
+    assert 0 < known[0] < known[1] == known[2] == known[3]
+
+
 def test_no_passes_leave_the_bsdf(scene):
     guide = train(scene, "gaussian_mixture", settings.with_changes(PARTICLES, {"passes": 0}), PATHS)
     a, b = (mi.render(scene, integrator=olpm_bench.integrator(g, max_depth=DEPTH), spp=8, seed=3) for g in (guide, None))
