@@ -26,8 +26,8 @@ from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.training import PassStatistics, Training
 
-PASSES = 40                 # rendering passes in a budget, at least: so it is met within 1/40
-SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
+PASSES = 24                 # rendering passes in a budget, at least: so it is met within 1/24
+SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows; guided ones of 16 spp cost 1.4 times those of 64 a sample
 MAX_LANES = 2**24           # paths in flight: about 2 GB
 REPEATS = 3                 # timings of a pass in the warm-up: the shortest counts, a single one may be ten times as long
 WARM_UP_PATHS = 20_000      # photons and importons of the training that compiles the kernels
@@ -134,7 +134,7 @@ def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> Warm
                 with clock.lap("render", kernels.compiled):
                     render_pass(scene, integrator, WARM_UP_SEED, spp)
                 times.append(clock.charged)
-            if min(times) > SHORTEST_PASS / 4 or 4 * spp > largest_pass(spec):
+            if min(times) > seconds_of_pass(spec) / 4 or 4 * spp > largest_pass(spec):
                 return WarmUp(kernels.seconds, max(min(times), 1e-6) / spp)
             spp *= 4
 
@@ -142,6 +142,11 @@ def warm_up(spec: CellSpec, scene: mi.Scene, guide: Guide | None = None) -> Warm
 def largest_pass(spec: CellSpec) -> int:
     """Samples a pixel that a pass may take for the sake of memory."""
     return max(1, MAX_LANES // (spec.scene.width * spec.scene.height))
+
+
+def seconds_of_pass(spec: CellSpec) -> float:
+    """Charged seconds that a rendering pass may take; for a budget in samples, that it takes at least."""
+    return max(SHORTEST_PASS, (spec.budget.seconds or 0) / PASSES)
 
 
 def spp_of_pass(spec: CellSpec, warm: WarmUp | None = None) -> int:
@@ -153,7 +158,7 @@ def spp_of_pass(spec: CellSpec, warm: WarmUp | None = None) -> int:
         spp = (spec.budget.spp or 0) / PASSES
     else:
         assert warm is not None
-        spp = max(SHORTEST_PASS, spec.budget.seconds / PASSES) / warm.spp_seconds
+        spp = seconds_of_pass(spec) / warm.spp_seconds
     return power_of_two(min(spp, largest_pass(spec)))
 
 
