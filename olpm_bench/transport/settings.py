@@ -95,8 +95,8 @@ class TrainingSettings:
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
     schedule: Literal["interleaved", "importons_first", "single_batch"] = "interleaved"
     passes: int = 2
-    photons: int = 300_000
-    importons: int = 100_000
+    photons: int = 150_000
+    importons: int = 50_000
     camera_passes: int = 64
     camera_paths: int = 2 ** 17
     share: float | Literal["auto"] = 0.35
@@ -137,8 +137,8 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
 
 
 # The talk's particles, gather and schedule [T, L]: photons and importons only, a fixed fraction.
-_PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "importons": 300_000, "camera_passes": 0,
-          "learn_fraction": False, "weight_window": "flux", "fraction": 0.5}
+_PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "photons": 300_000, "importons": 300_000,
+          "camera_passes": 0, "learn_fraction": False, "weight_window": "flux", "fraction": 0.5}
 
 # What each preset changes of the defaults, which are those of `best`.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
