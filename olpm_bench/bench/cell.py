@@ -27,7 +27,7 @@ from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.training import PassStatistics, Training
 
 PASSES = 24                 # rendering passes in a budget, at least: so it is met within 1/24
-SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows; guided ones of 16 spp cost 1.4 times those of 64 a sample
+SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
 MAX_LANES = 2**24           # paths in flight: about 2 GB
 REPEATS = 3                 # timings of a pass in the warm-up: the shortest counts, a single one may be ten times as long
 WARM_UP_PATHS = 20_000      # photons and importons of the training that compiles the kernels

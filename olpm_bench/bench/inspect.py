@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench import scenes
 from olpm_bench.bench import cell as cells
 from olpm_bench.bench import environment, vertex
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec, ConfigError, Experiment
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.results import SCHEMA_VERSION, Results, slug, write_json
-from olpm_bench.report import figures, records
+from olpm_bench.report import figures, landings, records
 from olpm_bench.report import inspect as picture
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.gather import GATHERS, Gathered, binned
 from olpm_bench.transport.guide import MIN_PARTICLES, Guide
 from olpm_bench.transport.particles import emit_photons, trace
-from olpm_bench.transport.training import Training
+from olpm_bench.transport.training import PassStatistics, Training
 from olpm_bench.transport.view import records_seen
 from olpm_bench.transport.window import by_contribution
 
@@ -37,16 +38,18 @@ IMAGE_PATHS = 2 ** 20       # of the image that shows where the pixel is
 
 @dataclass
 class Learnt:
-    """A method's guide, what its last pass would bring to its records, and where it comes from."""
+    """A method's guide, what its last pass would bring to its records, where it comes from, and the passes of its training."""
     guide: Guide
     batches: dict[str, Gathered]        # by kind of particles
     source: str
+    passes: list[PassStatistics] = field(default_factory=list)
 
 
 def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, int]], *, scene: str | None = None,
             seed: int | None = None, number: int | None = None, path_seed: int = 0, passes: int = 16,
             guides: Mapping[str, Path] | None = None) -> list[Path]:
-    """Draw what each pixel meets, and the records of each method; returns the files written.
+    """Draw what each pixel meets, the records of each method, and where the particles of its training land, by room, if the
+    scene is an embedded one that has several; returns the files written.
 
     The last method's guide guides the paths of the truth and of the image, which are unbiased with any.
 
@@ -87,6 +90,8 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
         image = _image(loaded, (guided or specs)[-1], best)
         shown = records_seen(loaded, best).record if best is not None else None
         written = _records_maps(loaded, learnt, image, pixels, folder / "inspect" / slug(name))
+        if rooms := _rooms(specs[0]):
+            written += _by_room(learnt, rooms[0], folder / "inspect", slug(name))
         for index, (pixel, at) in enumerate(vertices.items()):
             truth = vertex.truth(loaded, at, specs[0].integrator, best, passes, seed=path_seed,
                                  on_pass=progress(len(guided) + index, f"truth at {pixel[0]},{pixel[1]}"))
@@ -126,22 +131,25 @@ def _vertex(scene: mi.Scene, pixel: tuple[int, int], max_depth: int, number: int
 def _train(scene: mi.Scene, spec: CellSpec, results: Results, on_progress: Callable[[float], None]) -> Learnt:
     """Train as the cell does."""
     assert spec.training is not None
-    training = Training(scene, spec.method.representation or {}, spec.training, spec.integrator, spec.seed)
+    rooms = _rooms(spec)
+    training = Training(scene, spec.method.representation or {}, spec.training, spec.integrator, spec.seed,
+                        regions=(rooms[1], len(rooms[0])) if rooms else None)
     cell, seconds, wanted = None, spec.budget.seconds, training.passes
     if seconds is not None and (cell := results.read_cell(spec.scene.name, spec.method.name, spec.seed)) is not None:
         wanted = min(wanted, cell.info["training_passes"])
-    clock, done, seen, told = Clock(count_wait=environment.uses_llvm()), 0, 0.0, dict[str, None]()
+    clock, done, seen, told = Clock(count_wait=environment.uses_llvm()), list[PassStatistics](), 0.0, dict[str, None]()
     passes = training.run()
     with cells.Kernels.watched() as kernels:
-        while done < wanted and (cell is not None or clock.charged < cells.end_of_training(
+        while len(done) < wanted and (cell is not None or clock.charged < cells.end_of_training(
                 spec.training.share, seconds, clock.charged, seen)):
             with clock.lap("train", kernels.compiled):
                 statistics = next(passes)
                 dr.sync_thread()
-            done, seen = done + 1, statistics.seen or seen
+            seen = statistics.seen or seen
+            done.append(statistics)
             told |= dict.fromkeys(statistics.warnings)
-            on_progress(done / wanted)
-    source = f"trained with {done} passes"
+            on_progress(len(done) / wanted)
+    source = f"trained with {len(done)} passes"
     if cell is not None:
         source += f", as its cell {cell.folder}"
         if cell.info.get("key") != spec.key:
@@ -149,7 +157,11 @@ def _train(scene: mi.Scene, spec: CellSpec, results: Results, on_progress: Calla
     elif seconds is not None:
         source += f", as many as end training here, after {clock.charged:.1f} s (there is no cell to follow)"
     source += "".join(f"; {warning}" for warning in told)
-    return Learnt(training.radiance, _last_pass(scene, spec, training.radiance, training), source)
+    return Learnt(training.radiance, _last_pass(scene, spec, training.radiance, training), source, done)
+
+
+def _rooms(spec: CellSpec) -> tuple[tuple[str, ...], Callable[[np.ndarray], np.ndarray]] | None:
+    return None if spec.scene.file else scenes.rooms(spec.scene.name, spec.scene.arguments)
 
 
 def _from_file(scene: mi.Scene, spec: CellSpec, path: Path) -> Learnt:
@@ -205,6 +217,16 @@ def _records_maps(scene: mi.Scene, learnt: Mapping[str, Learnt], image: np.ndarr
     for name, method in learnt.items():
         written.append(stem.with_name(f"{stem.name}_records_{slug(name)}.png"))
         records.records_map(records_seen(scene, method.guide), image, MIN_PARTICLES, written[-1], marks=pixels)
+    return written
+
+
+def _by_room(learnt: Mapping[str, Learnt], rooms: Sequence[str], out: Path, scene: str) -> list[Path]:
+    written = []
+    for name, method in learnt.items():
+        if any(statistics.regions for statistics in method.passes):
+            with figures.style():
+                figures.save(landings.draw(method.passes, rooms), out, f"{scene}_particles_{slug(name)}")
+            written.append(out / f"{scene}_particles_{slug(name)}.png")
     return written
 
 

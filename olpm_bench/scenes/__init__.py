@@ -6,7 +6,8 @@
 
 Each embedded scene is a module of this package whose ``build(**parameters)`` returns a dictionary for
 ``mi.load_dict``, and whose ``check`` of the same parameters refuses values out of their range.  Its first docstring
-line is its description, and its ``VERSION`` grows when the image changes.
+line is its description, and its ``VERSION`` grows when the image changes.  One of several rooms names them in ``ROOMS``, and
+its ``room`` tells in which a point is.
 A new one is a file and a word in ``EMBEDDED``.  Nothing here loads Mitsuba: :mod:`olpm_bench.scenes.load` does.
 """
 from __future__ import annotations
@@ -16,10 +17,13 @@ import importlib
 import inspect
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 from xml.etree import ElementTree
+
+import numpy as np
 
 from olpm_bench.transport.settings import InputError
 
@@ -68,6 +72,16 @@ def build(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
         SceneError: no such scene, a parameter it has not, or a value out of its range.
     """
     return _module(name).build(**resolve(name, changes))
+
+
+def rooms(name: str, changes: dict[str, Any] | None = None) -> tuple[tuple[str, ...], Callable[[np.ndarray], np.ndarray]] | None:
+    """The rooms of an embedded scene, and what gives the index of that in which each of some points [n, 3] is; None: it has one.
+
+    Raises:
+        SceneError: as `resolve`.
+    """
+    module, rotation = _module(name), resolve(name, changes).get("rotation")
+    return (module.ROOMS, lambda p: module.room(p, rotation)) if hasattr(module, "ROOMS") else None
 
 
 def check_range(what: str, value: float, low: float, high: float, unit: str = "") -> None:

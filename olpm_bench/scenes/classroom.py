@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from olpm_bench.scenes.geometry import Part
 
 VERSION = 1                     # grows when the image changes
+ROOMS = ("classroom", "outside")
 
 LENGTH, DEPTH, HEIGHT = 7.4, 5.6, 3.1                       # of the room, along x, y and z [m]
 SLAB, THICK = 0.1, 0.25                                     # thickness of the walls, and of that with the windows [m]
@@ -78,6 +79,12 @@ def build(slat_angle: float = 20.0, sun_elevation: float = 38.0, sun_azimuth: fl
         "film": {"type": "hdrfilm", "width": 320, "height": 180},
     }
     return scene
+
+
+def room(p: np.ndarray, rotation: float = -28.9) -> np.ndarray:
+    """Index into `ROOMS` of points [n, 3]; the windows' reveals and the jalousies are outside."""
+    from olpm_bench.scenes.geometry import inside, turn_z
+    return np.where(inside(p @ turn_z(rotation), (LENGTH, DEPTH, HEIGHT)), 0, 1)
 
 
 def check(slat_angle: float, sun_elevation: float, sun_azimuth: float, sky: float, rotation: float) -> None:

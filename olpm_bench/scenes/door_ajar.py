@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from olpm_bench.scenes.geometry import Part
 
 VERSION = 1                     # grows when the image changes
+ROOMS = ("dark room", "corridor")
 
 WIDTH, DEPTH, HEIGHT = 3.2, 2.7, 2.35       # dark room [m]
 FAR_DEPTH, FAR_HEIGHT = 1.6, 2.1            # corridor [m]
@@ -85,7 +86,7 @@ def slit(gap: float = 0.07, rotation: float = 23.7) -> np.ndarray:
 
 
 def room(p: np.ndarray, rotation: float = 23.7) -> np.ndarray:
-    """0 for points [n, 3] in the dark room, with the camera; 1 for those in the corridor: the wall's middle parts them."""
+    """Index into `ROOMS` of points [n, 3]: the wall's middle parts them."""
     from olpm_bench.scenes.geometry import turn_z
     return ((p @ turn_z(rotation))[:, 1] > (DEPTH + LIT) / 2).astype(int)
 

@@ -30,6 +30,11 @@ def turn_z(degrees: float) -> Array:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
+def inside(p: Array, size: Vector, margin: float = 0.01) -> Array:
+    """Whether points [n, 3] are in the box from the origin to `size`, or at most `margin` from it [m]."""
+    return np.all((p > -margin) & (p < np.asarray(size) + margin), axis=1)
+
+
 def quad(corner: Vector, u: Vector, v: Vector, in_metres: bool = False) -> Part:
     """Parallelogram `corner` + s u + t v, facing u x v; uv = (s, t), or in metres along u and v."""
     o, u_, v_ = (np.asarray(x, float) for x in (corner, u, v))

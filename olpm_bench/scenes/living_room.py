@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from olpm_bench.scenes.geometry import Part
 
 VERSION = 1                     # grows when the image changes
+ROOMS = ("dim room", "sunny room", "outside")
 
 DIM, SUNNY, DEPTH, HEIGHT = 3.4, 2.5, 4.0, 2.5      # widths of the rooms, their depth and height [m]
 WALL, THICK = 0.1, 0.4                              # thickness of the walls, and of that with the window [m]
@@ -76,6 +77,14 @@ def build(gap: float = 0.2, sun_elevation: float = 36.0, sun_azimuth: float = -3
         "film": {"type": "hdrfilm", "width": 320, "height": 180},
     }
     return scene
+
+
+def room(p: np.ndarray, rotation: float = 37.3) -> np.ndarray:
+    """Index into `ROOMS` of points [n, 3]: the partition's middle parts the rooms, the curtains' lining ends the sunny one."""
+    from olpm_bench.scenes.geometry import inside, turn_z
+    p = p @ turn_z(rotation)
+    indoors = inside(p, (DIM + WALL / 2, DEPTH, HEIGHT)) | inside(p, (RIGHT, LINING, HEIGHT))
+    return np.where(indoors, p[:, 0] > DIM + WALL / 2, 2)
 
 
 def check(gap: float, sun_elevation: float, sun_azimuth: float, rotation: float) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from olpm_bench import scenes
 from olpm_bench.scenes import SceneError
+from olpm_bench.scenes.geometry import turn_z
 from olpm_bench.scenes.load import load
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "scenes"
@@ -197,3 +198,22 @@ def test_the_registry_needs_no_mitsuba():
     code = ("import sys; from olpm_bench import scenes; scenes.names(); scenes.parameters('door_ajar'); "
             "scenes.digest('door_ajar'); assert not {'mitsuba', 'drjit'} & set(sys.modules)")
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[2])
+
+
+@pytest.mark.parametrize("rotation", [0.0, 23.7, 200.0])
+@pytest.mark.parametrize("name, points", [
+    ("door_ajar", [(0.25, 0.1, 1.5), (1.8, 2.69, 0), (1.8, 2.8, 1), (0.5, 4.4, 2.1)]),
+    ("living_room", [(0.3, 0.25, 1.35), (3.4, 4, 2.5), (3.5, 0, 0), (6, 3.75, 1), (5, 3.8, 1), (5, 9, 0)]),
+    ("classroom", [(0.25, 0.35, 1.75), (7.4, 5.6, 3.1), (1.5, 5.7, 1.5), (-0.1, 2, 1)]),
+])
+def test_rooms_of_points(name, points, rotation):
+    """The camera's first; by the scenes' plans, whose surfaces belong to the rooms that see them."""
+    rooms, room = scenes.rooms(name, {"rotation": rotation})
+    expected = sorted(list(range(len(rooms))) * 2)
+    np.testing.assert_array_equal(room(np.array(points) @ turn_z(rotation).T), expected)
+
+
+def test_a_scene_of_one_room_has_none_to_tell_apart():
+    assert scenes.rooms("cornell_box") is None
+    with pytest.raises(SceneError, match="no parameter 'gap'"):
+        scenes.rooms("cornell_box", {"gap": 1})

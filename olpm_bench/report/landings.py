@@ -26,6 +26,7 @@ def draw(passes: Sequence[PassStatistics], names: Sequence[str]) -> Figure:
     """
     from matplotlib import rcParams
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
     from matplotlib.ticker import MaxNLocator, PercentFormatter
 
     figure = Figure(figsize=(6.6, 2.4), layout="constrained")
@@ -35,13 +36,14 @@ def draw(passes: Sequence[PassStatistics], names: Sequence[str]) -> Figure:
         total = np.maximum(hits[:, :, 0].sum(1, keepdims=True), 1)
         for r, (name, style) in enumerate(zip(names, rcParams["axes.prop_cycle"](), strict=False)):
             axes.plot(index, hits[:, r, 0] / total[:, 0], **style, label=name)
-            axes.fill_between(index, hits[:, r, 1] / total[:, 0], color=style["color"], alpha=0.17, linewidth=0,
-                              label=f"{name}: effective")
+            axes.fill_between(index, hits[:, r, 1] / total[:, 0], color=style["color"], alpha=0.17, linewidth=0)
         axes.set_title(kind)
         axes.set_xlabel("training pass")
-        axes.set_ylim(0, 1)
+        axes.set_ylim(bottom=0)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.yaxis.set_major_formatter(PercentFormatter(1))
     figure.axes[0].set_ylabel("share of the hits")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2 * len(names))
+    lines = figure.axes[0].get_lines()
+    shade = Patch(color="black", alpha=0.17, linewidth=0, label="shaded: their effective number")
+    figure.legend(handles=[*lines, shade], loc="outside lower center", ncols=len(lines) + 1)
     return figure
