@@ -1,4 +1,4 @@
-"""Spread over seeds, and comparisons between methods: bands, bootstrap intervals, equal error, means of ratios.
+"""Spread over seeds, and comparisons between methods: bands, intervals of ratios, equal error, means of ratios.
 
 Error curves live on log-log axes, where convergence is a straight line of slope -1/2, so they are interpolated
 there, and never beyond what was measured.  Seeds are paired: seed i of one method with seed i of another.
@@ -26,7 +26,7 @@ class Band(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """An estimate and its bootstrap interval (90 %), NaN where there is none."""
+    """An estimate and its interval (90 %), NaN where there is none."""
     value: float
     low: float
     high: float
@@ -134,6 +134,27 @@ def bootstrap(statistic: Callable[[np.ndarray], float], n: int, seed: int = 0, l
     return Interval(value, float(low), float(high))
 
 
+def jackknife(statistic: Callable[[np.ndarray], float], n: int, least: int = 1) -> Interval:
+    """Interval of a positive statistic of seeds from its logarithm without one of them at a time (Tukey 1958), by Student's t.
+
+    For statistics that count how often a seed was drawn, as variances do: a bootstrap draws some twice.
+
+    Args:
+        statistic, n, least: as in `bootstrap`.
+
+    Returns:
+        The interval is NaN with `least` seeds or fewer, and where the statistic without some seed has no logarithm.
+    """
+    seeds = np.arange(n)
+    value = float(statistic(seeds))
+    if n <= least:
+        return Interval(value, float("nan"), float("nan"))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        without = np.log([statistic(np.delete(seeds, i)) for i in seeds])
+    reach = np.exp(special.stdtrit(n - 1, BAND[1] / 100) * np.sqrt((n - 1) * np.var(without)))
+    return Interval(value, float(value / reach), float(value * reach))
+
+
 def expanded_band(confidence: float, n: int) -> tuple[float, float]:
     """Percentiles whose ends each bound a statistic of `n` seeds with the given confidence.
 
@@ -189,11 +210,11 @@ def error_ratio(baseline: Curve, method: Curve, seconds: float | None = None) ->
 
 
 def gain(baseline: Work, method: Work) -> Interval:
-    """Work-normalised variance of the baseline over that of the method, with a paired bootstrap interval.
+    """Work-normalised variance of the baseline over that of the method, with a paired jackknife interval.
 
     Returns:
-        NaN with one seed or black images; no interval with two seeds, which resample to themselves.  Few seeds have narrow
-        intervals: of simulated gains they covered 81 to 89 % with 6 and 8 seeds, half with 3.
+        NaN with one seed or black images; no interval with two seeds, which leave no variance.  Of simulated gains the intervals
+        cover 87 to 93 % with 3, 6 and 8 seeds, those of a bootstrap 57 to 84 %.
     """
     if len(baseline.seconds) != len(method.seconds):
         raise ValueError(f"{len(baseline.seconds)} and {len(method.seconds)} seeds: methods are compared in pairs of seeds")
@@ -201,7 +222,7 @@ def gain(baseline: Work, method: Work) -> Interval:
     def ratio(index: np.ndarray) -> float:
         a, b = (metrics.relative_variance(work.luminance[index]) * work.seconds[index].mean() for work in (baseline, method))
         return float(a / b) if b > 0 else float("nan")
-    return bootstrap(ratio, len(method.seconds), least=2)
+    return jackknife(ratio, len(method.seconds), least=2)
 
 
 def _paired(a: Curve, b: Curve) -> None:

@@ -92,7 +92,7 @@ def summarise(experiment: Experiment, results: Results, references: Mapping[str,
 
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
     `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, `invalid_pixels` is the
-    sum.  `gain` is the baseline's work-normalised variance over the method's, with its 90 % bootstrap interval.  What has no
+    sum.  `gain` is the baseline's work-normalised variance over the method's, with its 90 % jackknife interval.  What has no
     value (a spread of one seed, the error of an image with NaN or of a scene without reference) is None.
 
     Args:

@@ -114,7 +114,7 @@ def gains(results: Results, experiment: Experiment, summarised: Mapping[str, Any
     if not any(row["gain"] is not None for row in rows):
         return False
     n, machine_ = len(experiment.seeds), machine(read_json(results.folder / "env.json"))
-    spread = f"90 % bootstrap intervals over {n} paired seeds." if n > 2 else f"{n} seeds."
+    spread = f"90 % jackknife intervals over {n} paired seeds." if n > 2 else f"{n} seeds."
     with style():
         figure = draw_gains(rows, [method.name for method in experiment.method], experiment.baseline_name, experiment.title,
                             f"Relative variance of a pixel (median) times charged seconds. {spread} {machine_}")
