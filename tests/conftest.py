@@ -11,6 +11,7 @@ import pytest
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--representation", help="check path/to/file.py:ClassName in test_conformance.py, instead of the registered")
+    parser.addoption("--grid", action="store_true", help="in test_grid.py, every emitter alone, with four times the samples")
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -100,6 +100,14 @@ def test_shared_scenes(name: str):
     assert film.rfilter().class_name() == "BoxFilter"
 
 
+def test_shapes_and_emitters_keep_the_order_of_the_file(tmp_path: Path):
+    emitter = '<emitter type="area"><rgb name="radiance" value="{0}"/></emitter>'
+    lamp = f'<shape type="cube" id="lamp{{0}}"><bsdf type="diffuse"/>{emitter}</shape>'
+    scene = load(xml(tmp_path, SENSOR, *(lamp.format(i) for i in range(1, 9))))
+    assert [shape.id() for shape in scene.shapes()] == [f"lamp{i}" for i in range(1, 9)]
+    assert [mi.traverse(emitter)["radiance.value"].x[0] for emitter in scene.emitters()] == list(range(1, 9))
+
+
 def test_an_absorbing_medium_is_ignored_only_where_the_file_ignores_it(tmp_path: Path):
     ball = SHAPE.replace("</shape>", FOG.format("0, 0, 0") + "</shape>")
     with pytest.warns(UserWarning, match="shape 'ball' has the participating medium 'homogeneous', which only absorbs"):

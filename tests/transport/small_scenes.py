@@ -13,15 +13,16 @@ from olpm_bench.check.small_scenes import blocks, box, camera, furnace, grey, la
 __all__ = ["assert_no_kernel_a_pass", "assert_same_expectation", "box", "camera", "furnace", "grey", "lamp", "passes", "wall"]
 
 
-def assert_same_expectation(a: np.ndarray, b: np.ndarray, level: float = 0.01) -> None:
-    """Welch's t-test a pixel (of 2 x 2 blocks' luminance), corrected for their number (Sidak); and one of the image means.
+def assert_same_expectation(a: np.ndarray, b: np.ndarray, level: float = 0.01, size: int = 2) -> None:
+    """Welch's t-test of each block of pixels' luminance, corrected for their number (Sidak); and one of the image means.
 
     Args:
         a, b: independent images [n, height, width, 3].
         level: probability that equal expectations fail.
+        size: of the blocks, pixels along each side.
     """
     assert np.isfinite(a).all() and np.isfinite(b).all()
-    x, y = blocks(a, 2), blocks(b, 2)
+    x, y = blocks(a, size), blocks(b, size)
     flat = (x.std(0) < 1e-6 * x.mean()) & (y.std(0) < 1e-6 * x.mean())
     np.testing.assert_allclose(x[:, flat].mean(0), y[:, flat].mean(0), rtol=1e-4)
     p = stats.ttest_ind(x[:, ~flat], y[:, ~flat], equal_var=False).pvalue
