@@ -20,6 +20,8 @@ from representations import RepresentationError
 from representations._llvm import LLVMError
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+ENDING = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]      # as Ctrl-C
+RESUMED = ("run", "submit", "gate", "reference")
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
                   help="Which learnt directional distribution guides a path tracer best?")
@@ -47,7 +49,8 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
     """
     @functools.wraps(body)
     def run(*args: Any, **kwargs: Any) -> None:
-        previous = signal.signal(signal.SIGTERM, _interrupt)
+        previous = {number: signal.signal(number, _interrupt) for number in ENDING
+                    if signal.getsignal(number) is signal.SIG_DFL}      # nohup ignores one
         try:
             body(*args, **kwargs)
         except (typer.Exit, typer.Abort):
@@ -55,7 +58,8 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
         except (KeyboardInterrupt, RuntimeError) as error:
             from olpm_bench.bench.progress import is_interrupt, reason
             if is_interrupt(error):
-                complain("interrupted; what is complete is kept, and the same command goes on from there")
+                complain("interrupted; " + ("what is complete is kept, and the same command goes on from there"
+                                            if body.__name__ in RESUMED else "the same command starts again"))
                 raise typer.Exit(INTERRUPTED) from None
             if isinstance(error, NotImplementedError | RecursionError):
                 raise
@@ -68,7 +72,8 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
             complain(str(error))
             raise typer.Exit(BAD_INPUT) from None
         finally:
-            signal.signal(signal.SIGTERM, previous)
+            for number, handler in previous.items():
+                signal.signal(number, handler)
     return app.command(body.__name__.strip("_"))(run)
 
 

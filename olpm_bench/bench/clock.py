@@ -97,7 +97,7 @@ class Clock:
         after = thread_times() if self.count_wait else None
         lap = charge(wall, cpu, before, after, cores())
         lap.compile = min(compiled(), wall)
-        lap.charged *= 1 - lap.compile / wall       # the compiler waited for cores like everybody else
+        lap.charged *= 1 - lap.compile / wall if wall else 0.0      # the compiler waited for cores like everybody else
         self.laps[label] = self[label] + lap
 
     def move(self, share: float, source: str, target: str) -> None:

@@ -123,10 +123,12 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
                 halves.seconds = before + clock.charged
                 bar.at(done + clock.charged, f"{spec.scene.name}: {halves}")
                 if time.monotonic() - saved > SAVE_SECONDS:
+                    alive(at_once=True)
                     write_reference(folder, halves.reference(meta))
                     saved = time.monotonic()
         finally:                # also when interrupted: what is there is a valid reference
             if min(halves.a.passes, halves.b.passes) >= 2 and halves.a.passes + halves.b.passes > resumed:
+                alive(at_once=True)         # who was silent for too long does not write over another's
                 write_reference(folder, halves.reference(meta))
     bar.say(f"{spec.scene.name}: {halves}, floor mean|A-B|/2 = {halves.reference(meta).noise_floor:.3g}: {folder}")
     return folder

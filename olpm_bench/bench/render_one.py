@@ -12,7 +12,7 @@ from olpm_bench.bench import environment
 from olpm_bench.bench.cell import load_scene, measure, warm_up
 from olpm_bench.bench.config import CellSpec, ConfigError, parse
 from olpm_bench.bench.progress import Bar
-from olpm_bench.bench.results import replacing, write_exr
+from olpm_bench.bench.results import check_writable, replacing, write_exr
 from olpm_bench.report import records, tonemap
 from olpm_bench.transport.guide import MIN_PARTICLES, Guide
 from olpm_bench.transport.view import records_seen
@@ -110,6 +110,8 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
     for path in (out, save_guide, records_map):
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: there is no folder {path.parent}")
+        if path is not None:
+            check_writable(path.parent)
     guide = _load_guide(load_guide, spec) if load_guide is not None else None
     scene = load_scene(spec)
     with Bar(1.0) as bar:

@@ -12,24 +12,27 @@ A result folder (`results/<stem of the TOML>`):
                                   lock              who is at work on it
     references/<scene-key>/{reference.exr, meta.json}
 
-Every file is written beside its place and renamed, so that it is whole or not there.  JSON has no NaN: null.
+Every file is written beside its place and renamed, so that it is whole or not there.  JSON has no NaN: null.  Images, traces
+and cell.json carry digests: what a disk, a copy or an editor has changed is not believed.
 """
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
 import re
 import shutil
 import socket
+import tempfile
 import time
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -62,14 +65,69 @@ def slug(name: str) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a path beside `path` to write to; it takes the place of `path` if the body succeeds, else it goes."""
+    """Yields a path beside `path` to write to; it takes the place of `path` if the body succeeds, else it goes.
+
+    Raises:
+        OSError: cannot be written; it names `path`.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getpid()}.tmp{path.suffix}")
+    beside = path.with_name(f".{path.name}.{_writer()}.tmp{path.suffix}")
     try:
         yield beside
         os.replace(beside, path)
+    except OSError as error:
+        if error.filename in (None, str(beside), beside):
+            error.filename, error.filename2 = str(path), None
+        raise
     finally:
-        beside.unlink(missing_ok=True)
+        _clean(lambda: beside.unlink(missing_ok=True))
+
+
+def _clean(remove: Callable[[], None]) -> None:
+    """Remove something, also if Ctrl-C comes in the middle."""
+    try:
+        remove()
+    except KeyboardInterrupt:
+        remove()
+        raise
+
+
+def check_writable(folder: Path) -> None:
+    """
+    Raises:
+        OSError: no file can be made in the folder, e.g. as it is read-only; it names the folder.
+    """
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from None
+
+
+def _writer() -> str:
+    """Who writes, in the names of unfinished files."""
+    return f"{socket.gethostname()}-{os.getpid()}"
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove the unfinished files in a folder whose writers were processes of this host and are gone."""
+    for left in folder.glob(f".*.{socket.gethostname()}-*.tmp*"):
+        pid = re.search(r"-(\d+)\.tmp[^-]*$", left.name)
+        if pid is not None and _started(int(pid[1])) is None:
+            _remove(left)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def digest(*content: bytes) -> str:
+    found = hashlib.sha256()
+    for part in content:
+        found.update(part)
+    return found.hexdigest()[:16]
 
 
 def write_text(path: Path, text: str) -> None:
@@ -105,7 +163,7 @@ def read_json(path: Path) -> dict[str, Any]:
         value = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ResultError(f"{path}: there is no such file") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ResultError(f"{path} is broken: {error}") from None
     if not isinstance(value, dict):
         raise ResultError(f"{path} is broken: not a JSON object")
@@ -130,7 +188,7 @@ def write_exr(path: Path, parts: dict[str, np.ndarray], header: dict[str, Any] |
 
     Args:
         parts: name -> (h, w, 3) as RGB or (h, w) as Y.
-        header: kept as JSON in the attribute `olpm_bench` of the first part.
+        header: kept as JSON in the attribute `olpm_bench` of the first part, beside a digest of header and pixels.
 
     Raises:
         OSError: cannot be written, e.g. the disk is full.
@@ -138,28 +196,34 @@ def write_exr(path: Path, parts: dict[str, np.ndarray], header: dict[str, Any] |
     import OpenEXR
 
     common = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    images = {name or "0": np.ascontiguousarray(image, dtype=np.float32) for name, image in parts.items()}
+    text = json.dumps(plain(header or {}), allow_nan=False)
+    first = {"olpm_bench": text, "olpm_bench_digest": _digest_of_exr(images, text)}
     exr: list[OpenEXR.Part] = []
-    for name, image in parts.items():
-        attributes = dict(common)
-        if header and not exr:
-            attributes["olpm_bench"] = json.dumps(plain(header), allow_nan=False)
-        channel = {"RGB" if image.ndim == 3 else "Y": np.ascontiguousarray(image, dtype=np.float32)}
-        exr.append(OpenEXR.Part(attributes, channel, name))
+    for name, image in images.items():
+        attributes = dict(common) if exr else common | first
+        exr.append(OpenEXR.Part(attributes, {"RGB" if image.ndim == 3 else "Y": image}, name))
     with replacing(path) as beside:
         try:
             OpenEXR.File(exr).write(str(beside))
-            OpenEXR.File(str(beside))           # the last buffer is flushed without a check: read it back
+            read_exr(beside)                    # the last buffer is flushed without a check
         except (RuntimeError, ValueError) as error:
             full = shutil.disk_usage(path.parent).free < sum(i.nbytes for i in parts.values())
             code = errno.ENOSPC if full or "No space" in str(error) else errno.EIO
             raise OSError(code, os.strerror(code) if code == errno.ENOSPC else str(error), str(path)) from None
 
 
+def _digest_of_exr(parts: dict[str, np.ndarray], header: str) -> str:
+    """Of the pixels, row by row, and the header's text.  OpenEXR reads many files that were cut short without a complaint."""
+    return digest(header.encode(), *(piece for name, image in sorted(parts.items())
+                                     for piece in (name.encode(), str(image.shape[:2]).encode(), image.tobytes())))
+
+
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """All parts, (h, w, 3) or (h, w, 1) float32, and the JSON of `write_exr`.
 
     Raises:
-        ResultError: missing or broken.
+        ResultError: missing or broken; of a file with a digest, whatever in it has changed.
     """
     import OpenEXR
 
@@ -167,7 +231,7 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise ResultError(f"{path}: there is no such file")
     try:
         exr = OpenEXR.File(str(path))
-        parts, header = {}, {}
+        parts, text, written = {}, "{}", None
         for index, part in enumerate(exr.parts):
             channels = part.channels
             if {"R", "G", "B"} <= channels.keys():
@@ -177,9 +241,12 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             pixels = pixels[..., :3] if pixels.ndim == 3 else pixels[..., None]
             parts[part.name() or str(index)] = np.asarray(pixels, np.float32)
             if index == 0:
-                header = json.loads(part.header.get("olpm_bench", "{}"))
-    except (RuntimeError, ValueError, StopIteration, AttributeError) as error:
+                text, written = part.header.get("olpm_bench", "{}"), part.header.get("olpm_bench_digest")
+        header = json.loads(text)
+    except (RuntimeError, ValueError, TypeError, StopIteration, AttributeError) as error:
         raise ResultError(f"{path} is broken: {str(error) or 'no RGB or Y channel'}") from None
+    if written is not None and written != _digest_of_exr(parts, text):
+        raise ResultError(f"{path} is broken: its digest is another")
     return parts, header
 
 
@@ -216,6 +283,16 @@ class Cell:
         return [parts[str(i)] for i in range(len(self.trace))]
 
 
+def _digests(info: dict[str, Any], trace: Path) -> dict[str, str]:
+    """What cell.json says of itself and of the trace.  Its key is compared with the experiment's instead."""
+    measured = {name: value for name, value in info.items() if name != "key"}
+    try:
+        content = trace.read_bytes()
+    except OSError as error:
+        raise ResultError(f"{trace} is broken: {error}") from None
+    return {"cell.json": digest(json.dumps(measured, sort_keys=True).encode()), "trace.jsonl": digest(content)}
+
+
 @dataclass
 class Accumulator:
     """Running mean of passes, and the variance of that mean from their spread (Welford 1962, weighted by samples).
@@ -238,11 +315,10 @@ class Accumulator:
 
     def add(self, image: np.ndarray, spp: int) -> None:
         """Add a pass: an image (h, w, 3) of `spp` samples a pixel."""
-        self.spp += spp
-        self.passes += 1
-        delta = image - self.mean
-        self.mean += delta * (spp / self.spp)
-        self.m2 += spp * delta * (image - self.mean)
+        total, delta = self.spp + spp, image - self.mean
+        mean = self.mean + delta * (spp / total)
+        m2 = self.m2 + spp * delta * (image - mean)
+        self.mean, self.m2, self.spp, self.passes = mean, m2, total, self.passes + 1       # at once: Ctrl-C tears nothing
 
     def variance(self) -> np.ndarray:
         """Variance of `mean` (h, w, 3); infinite before there are two passes."""
@@ -328,6 +404,9 @@ class Results:
         if not (folder / "cell.json").exists():
             return None
         info = read_json(folder / "cell.json")
+        digests = info.pop("digests", {})           # older cells have none
+        if digests and digests != _digests(info, folder / "trace.jsonl"):
+            raise ResultError(f"{folder / 'cell.json'} or trace.jsonl is broken: their digests are others")
         try:
             lines = (folder / "trace.jsonl").read_text(encoding="utf-8").splitlines()
             trace = [json.loads(line) for line in lines if line.strip()]
@@ -356,18 +435,21 @@ class Results:
             OSError: cannot be written; what was there stays as it was.
         """
         folder = self.cell_folder(scene, method, seed)
-        new = folder / f".cell.{socket.gethostname()}-{os.getpid()}.tmp"
+        new = folder / f".cell.{_writer()}.tmp"
         info = plain({"schema_version": SCHEMA_VERSION, "scene": scene, "method": method, "seed": seed, **info})
         try:
             write_exr(new / "image.exr", image, config)
             write_exr(new / "checkpoints.exr", {str(i): c for i, c in enumerate(checkpoints)})
             write_text(new / "trace.jsonl", "".join(json.dumps(plain(line), allow_nan=False) + "\n" for line in trace))
-            write_json(new / "cell.json", info)
+            write_json(new / "cell.json", {**info, "digests": _digests(info, new / "trace.jsonl")})
             (folder / "cell.json").unlink(missing_ok=True)      # an old cell.json never stands beside new images
             for name in ("image.exr", "checkpoints.exr", "trace.jsonl", "cell.json"):
                 os.replace(new / name, folder / name)
+        except OSError as error:
+            error.filename = str(error.filename).replace(str(new), str(folder))
+            raise
         finally:
-            shutil.rmtree(new, ignore_errors=True)
+            _clean(lambda: shutil.rmtree(new, ignore_errors=True))
         (folder / "failed.json").unlink(missing_ok=True)
         return Cell(scene, method, seed, info, trace, folder)
 
@@ -385,104 +467,171 @@ class Results:
                    {"schema_version": SCHEMA_VERSION, "scene": scene, "method": method, "seed": seed, "reason": reason})
 
 
+class Alive(Protocol):
+    """A sign of life of who holds a lock, to be given now and then; `at_once` also if the last was a moment ago.
+
+    Raises:
+        LockedError: the lock is lost.
+    """
+    def __call__(self, at_once: bool = False) -> None: ...
+
+
 @contextmanager
-def locked(folder: Path) -> Iterator[Callable[[], None]]:
+def locked(folder: Path) -> Iterator[Alive]:
     """Hold a folder (of a cell or a reference) while the body runs, by a file `lock` in it.
 
-    Yields a function that the body calls now and then as a sign of life; it raises LockedError if the lock is lost.
+    Yields what gives signs of life: before the body writes a result it does so at once, as the folder may be another's by then.
 
     The lock of a process of this host that no longer lives is taken over, and any after half an hour without a sign of life;
     unfinished files are removed.
 
     Raises:
-        LockedError: another process holds it.
+        LockedError: another process holds it, or has taken it over.
     """
     path = folder / "lock"
     folder.mkdir(parents=True, exist_ok=True)
-    mine, last = _acquire(path), time.monotonic()
+    me, last = _acquire(path), time.monotonic()
 
     def is_mine() -> bool:
         try:
-            return path.read_text() == mine
+            return _read_lock(path) == me
         except FileNotFoundError:
             return False
 
-    def alive() -> None:
-        nonlocal last
-        if time.monotonic() - last < BEAT:
-            return
+    def check() -> None:
         if not is_mine():
             raise LockedError(f"{path} was lost to another process, after {time.monotonic() - last:.0f} s without a sign of life")
-        os.utime(path)
+
+    def alive(at_once: bool = False) -> None:
+        nonlocal last
+        if not at_once and time.monotonic() - last < BEAT:
+            return
+        check()
+        with path.open("r+b") as file:          # in place, and of the same length: needs no room on the disk
+            file.write(_signed(me))
         last = time.monotonic()
 
     try:
         for left in folder.glob(".*.tmp*"):
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                left.unlink(missing_ok=True)
+            _remove(left)
         yield alive
+    except OSError:
+        check()                     # an unfinished file may have gone with the lock
+        raise
     finally:
-        if is_mine():
-            path.unlink(missing_ok=True)
+        _clean(lambda: path.unlink(missing_ok=True) if is_mine() else None)
+
+
+def tidy(folder: Path) -> None:
+    """Remove lock and unfinished files of a process that was killed when its work was done."""
+    if (folder / "lock").exists() or any(folder.glob(".*.tmp*")):
+        with suppress(LockedError), locked(folder):
+            pass
 
 
 def _identity() -> dict[str, Any]:
-    import psutil
-    return {"pid": os.getpid(), "host": socket.gethostname(), "started": psutil.Process().create_time()}
+    """This process.  `boot` tells one run of a machine from another, `numbers` whose process numbers are meant (a container has
+    its own)."""
+    def read(read: Callable[[str], str], name: str) -> str:
+        try:
+            return read(name).strip()
+        except OSError:             # not on Linux
+            return ""
+    return {"pid": os.getpid(), "host": socket.gethostname(), "started": _started(os.getpid()),
+            "boot": read(lambda name: Path(name).read_text(), "/proc/sys/kernel/random/boot_id"),
+            "numbers": read(os.readlink, "/proc/self/ns/pid")}
 
 
-def _is_stale(owner: dict[str, Any], touched: float) -> bool:
-    """The owner was a process of this host and is gone (another process with its number does not count), was killed before it
-    had signed, or has been silent for too long.
-
-    Args:
-        touched: when the lock last showed a sign of life.
-    """
-    import psutil
-    if time.time() - touched > (LEASE if owner else SIGNING):
-        return True
-    if owner.get("host") != socket.gethostname():
-        return False
+def _started(pid: int) -> float | None:
+    """When a process was started [s], by a clock that nobody sets where there is one; None if it has ended."""
     try:
-        return abs(psutil.Process(int(owner["pid"])).create_time() - float(owner["started"])) > 1
-    except psutil.NoSuchProcess:
-        return True
-    except (KeyError, TypeError, ValueError, psutil.Error):
-        return False
+        state, *fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return None if state in "ZX" else int(fields[18]) / os.sysconf("SC_CLK_TCK")
+    except (FileNotFoundError, ProcessLookupError):
+        import psutil
+        try:
+            return None if Path("/proc/self/stat").exists() else psutil.Process(pid).create_time()
+        except psutil.Error:
+            return None
 
 
-def _acquire(path: Path) -> str:
-    """Create the lock; return what it says."""
-    identity = json.dumps(_identity())
+def _signed(owner: dict[str, Any]) -> bytes:
+    """What a lock says: its owner, and the last sign of life [s] by the clock of all processes since the machine started."""
+    return json.dumps({**owner, "alive": f"{time.monotonic():020.3f}"}).encode()
+
+
+def _read_lock(path: Path, alive: bool = False) -> dict[str, Any]:
+    """The owner of a lock, with or without the last sign of life; {} before it has signed.
+
+    Raises:
+        FileNotFoundError: nobody's.
+    """
+    content = path.read_bytes()
+    try:
+        owner = json.loads(content or b"{}")
+        return {key: value for key, value in owner.items() if alive or key != "alive"}
+    except (ValueError, AttributeError):
+        return {"unreadable": content}
+
+
+def _silence(owner: dict[str, Any], path: Path) -> float:
+    """Seconds since a lock's last sign of life; infinite if its owner has ended.
+
+    On one machine nobody's clock counts but the one that cannot be set; between machines, that of the file system.
+    """
+    me = _identity()
+    with suppress(KeyError, TypeError, ValueError):     # of another version
+        if owner["host"] == me["host"]:
+            if owner["boot"] != me["boot"]:
+                return math.inf                         # the machine was started again
+            if owner["numbers"] == me["numbers"] and _started(owner["pid"]) != owner["started"]:
+                return math.inf                         # also if another process has its number now
+            return time.monotonic() - float(owner["alive"])
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".now.", suffix=".tmp") as now:
+        return abs(os.fstat(now.fileno()).st_mtime - path.stat().st_mtime)      # set back, it may be in the future
+
+
+def silence(folder: Path) -> float | None:
+    """Seconds since the last sign of life of who holds a folder, infinite if that process has ended; None if nobody does."""
+    try:
+        return _silence(_read_lock(folder / "lock", alive=True), folder / "lock")
+    except FileNotFoundError:
+        return None
+
+
+def _acquire(path: Path) -> dict[str, Any]:
+    """Create the lock; return its owner, this process."""
+    me = _identity()
     for _ in range(3):
         try:
             handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
         except FileExistsError:
             try:
-                text, touched = path.read_text(), path.stat().st_mtime
-                owner = json.loads(text or "{}")        # empty: about to be written
+                owner = _read_lock(path, alive=True)
+                silent = _silence(owner, path)
             except FileNotFoundError:                   # released meanwhile
                 continue
-            except ValueError:
-                raise LockedError(f"{path} is held by somebody unknown; delete it if nothing runs") from None
-            if not _is_stale(owner, touched):
-                raise LockedError(f"{path} is held by process {owner.get('pid')} on {owner.get('host')}") from None
-            aside = path.with_name(f".lock.{socket.gethostname()}-{os.getpid()}")
+            if silent <= (LEASE if owner else SIGNING):
+                who = f"process {owner['pid']} on {owner['host']}" if {"pid", "host"} <= owner.keys() else "somebody unknown"
+                raise LockedError(f"{path} is held by {who}, whose last sign of life was {silent:.0f} s ago; "
+                                  f"after {LEASE / 60:.0f} minutes without one it is taken over") from None
+            aside = path.with_name(f".lock.{_writer()}.tmp")
             try:
                 os.rename(path, aside)                  # one of those who try this succeeds
             except FileNotFoundError:
                 continue
-            if aside.read_text() != text:       # another was faster, and its new lock was moved: put it back
-                os.link(aside, path)
+            if _read_lock(aside, alive=True) != owner:  # it lives, or another was faster: put back what was moved
+                with suppress(OSError):
+                    os.link(aside, path)
             aside.unlink()
             continue
         try:
-            os.write(handle, identity.encode())
-        finally:
-            os.close(handle)
-        return identity
+            with os.fdopen(handle, "wb") as file:
+                file.write(_signed(me))
+        except BaseException:       # a full disk, Ctrl-C
+            path.unlink(missing_ok=True)
+            raise
+        return me
     raise LockedError(f"{path} is contended")
 
 
@@ -511,8 +660,13 @@ def read_reference(path: Path, width: int, height: int) -> Reference:
         image = _shrink(image, width, height, path)
         unknown = np.full_like(image, np.inf)
         return Reference(image, image, unknown, unknown, {"estimator": f"{path.name}, of another renderer"})
-    meta = read_json(path / "meta.json")
-    parts, header = read_exr(path / "reference.exr")
+    try:
+        meta = read_json(path / "meta.json")
+        parts, header = read_exr(path / "reference.exr")
+    except NewerSchemaError:
+        raise
+    except ResultError as error:
+        raise ResultError(f"{error}; remove the folder and make it again") from None
     meta |= header          # of the same moment as the pixels, should the two files differ
     for name in ("a.mean", "b.mean", "a.variance", "b.variance"):
         if name not in parts or not np.isfinite(parts[name]).all():

@@ -25,6 +25,8 @@ from olpm_bench.bench.results import (
     find_reference,
     locked,
     read_reference,
+    remove_unfinished,
+    tidy,
 )
 from olpm_bench.bench.shard import WHOLE, Shard
 
@@ -87,8 +89,11 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
     todo, problems = [], []
     for spec in cells:
         complete, why = is_complete(results, spec)
-        if not complete:
+        if complete:
+            tidy(results.cell_folder(spec.scene.name, spec.method.name, spec.seed))
+        else:
             todo.append((spec, why))
+    remove_unfinished(results.folder)
     results.write_text("experiment.toml", experiment.toml(results.folder))
     results.write_json("env.json", environment.describe())
 
@@ -110,6 +115,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
                     queue.append((index, (spec, "")))
                     held += 1
                     if held >= len(queue):          # all that is left is in other hands
+                        bar.at(len(todo) - len(queue), f"waiting for {spec}: {error}")
                         time.sleep(PATIENCE)
                         held = 0
                     continue
@@ -177,6 +183,7 @@ def _run_cell(results: Results, spec: CellSpec, scene: mi.Scene, warm: dict[tupl
             results.write_failure(*names, reason(error))
             raise CellFailedError(reason(error)) from error
         info = {**done.info, "machine": environment.machine()}
+        alive(at_once=True)                     # who was silent for too long leaves the cell to who took it over
         return results.write_cell(*names, info, done.trace, done.image, done.checkpoints, spec.config())
 
 

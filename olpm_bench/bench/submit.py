@@ -6,6 +6,7 @@ tasks of one array, each with a node of its own; the "local" executor runs the s
 """
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,11 @@ from olpm_bench.bench import config, environment
 from olpm_bench.bench.clock import cores
 from olpm_bench.bench.config import ConfigError, Experiment
 from olpm_bench.bench.progress import Bar
-from olpm_bench.bench.results import Results
+from olpm_bench.bench.results import LEASE, Results, silence
 
 CLUSTERS = ("slurm", "local")
 POLL = 1.0                  # [s] between looks at local workers
+GRACE = 60.0                # [s] that they have to notice that all is complete
 
 
 class Worker(Checkpointable):
@@ -86,16 +88,32 @@ def submit(experiment: Experiment, root: Path, cluster: str, workers: int, minut
 
 
 def wait(jobs: list[submitit.Job[list[str]]], experiment: Experiment, root: Path) -> None:
-    """Wait for local workers; if this is interrupted, so are they."""
+    """Wait for local workers; if this is interrupted, so are they.
+
+    Those that hang are stopped: all, if none gives a sign of life in half an hour, and who has not ended a minute after another
+    has found that all is complete.
+    """
     results = Results(root / experiment.stem)
-    cells = [results.cell_folder(spec.scene.name, spec.method.name, spec.seed) / "cell.json" for spec in experiment.cells()]
+    cells = [results.cell_folder(spec.scene.name, spec.method.name, spec.seed) for spec in experiment.cells()]
+    end = math.inf
     try:
         with Bar(len(cells)) as bar:
-            while not all(job.done() for job in jobs):
-                complete = sum(cell.exists() for cell in cells)
-                bar.at(complete, f"{complete} of {len(cells)} cells, {len(jobs)} workers")
+            while running := [job for job in jobs if not job.done()]:
+                complete = sum((cell / "cell.json").exists() for cell in cells)
+                bar.at(complete, f"{complete} of {len(cells)} cells, {len(running)} workers")
+                silent = [seconds for cell in cells if math.isfinite(seconds := silence(cell) or math.inf)]
+                if end == math.inf and any(_is_content(job) for job in jobs if job not in running):
+                    end = time.monotonic() + GRACE
+                if time.monotonic() > end or (silent and min(silent) > LEASE):
+                    bar.say(f"{len(running)} of {len(jobs)} workers hang and are stopped")
+                    break
                 time.sleep(POLL)
-    except BaseException:
+    finally:
         for job in jobs:
-            job.cancel(check=False)
-        raise
+            if not job.done():
+                job.cancel(check=False)
+
+
+def _is_content(job: submitit.Job[list[str]]) -> bool:
+    """Whether a worker that has ended found all cells complete."""
+    return job.exception() is None and job.result() == []

@@ -4,13 +4,12 @@ from __future__ import annotations
 import errno
 import json
 import os
-import socket
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 
 import numpy as np
-import psutil
 import pytest
 
 from olpm_bench.bench import results as r
@@ -98,6 +97,10 @@ def test_a_checkpoint_too_few_is_noticed(tmp_path):
     cell = write_cell(Results(tmp_path), checkpoints=3)
     trace = cell.folder / "trace.jsonl"
     trace.write_text("".join(trace.read_text().splitlines(keepends=True)[:2]))
+    with pytest.raises(ResultError, match=r"trace\.jsonl is broken"):
+        Results(tmp_path).verified_cell("a scene", "GMM, K = 8", 0)
+    info = json.loads((cell.folder / "cell.json").read_text())
+    r.write_json(cell.folder / "cell.json", info | {"digests": {}})          # of an older version
     with pytest.raises(ResultError, match="3 images for 2 checkpoints"):
         Results(tmp_path).verified_cell("a scene", "GMM, K = 8", 0)
 
@@ -188,8 +191,11 @@ def test_a_complete_cell_outlives_the_failure_of_its_successor(tmp_path, monkeyp
 # ---------------------------------------------------------------- locks
 
 def owner(**changes) -> str:
-    me = {"pid": os.getpid(), "host": socket.gethostname(), "started": psutil.Process().create_time()}
-    return json.dumps(me | changes)
+    return json.dumps({**json.loads(r._signed(r._identity())), **changes})
+
+
+def silent(seconds: float) -> str:
+    return f"{time.monotonic() - seconds:020.3f}"
 
 
 def dead_pid() -> int:
@@ -209,8 +215,8 @@ def test_a_lock_is_held_by_one(tmp_path):
     assert list((tmp_path / "cell").iterdir()) == []
 
 
-@pytest.mark.parametrize("stale", [lambda: owner(pid=dead_pid()), lambda: owner(started=1.0)],
-                         ids=["dead", "reused number"])
+@pytest.mark.parametrize("stale", [lambda: owner(pid=dead_pid()), lambda: owner(started=1.0), lambda: owner(boot="another")],
+                         ids=["dead", "reused number", "before the machine was started again"])
 def test_the_lock_of_the_dead_is_taken_over(tmp_path, stale):
     (tmp_path / "lock").write_text(stale())
     (tmp_path / ".image.exr.host-1.tmp.exr").write_text("half an ima")
@@ -221,35 +227,51 @@ def test_the_lock_of_the_dead_is_taken_over(tmp_path, stale):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("text, age", [(lambda: owner(host="elsewhere", pid=1), r.LEASE), (owner, r.LEASE), (str, r.SIGNING)],
-                         ids=["another host", "hangs here", "killed before it had signed"])
-def test_the_lock_of_the_silent_is_taken_over_and_they_notice(tmp_path, text, age, monkeypatch):
+@pytest.mark.parametrize("text, age", [
+    (lambda silence: owner(host="elsewhere", pid=1), r.LEASE), (lambda silence: "not JSON", r.LEASE),
+    (lambda silence: owner(alive=silent(silence)), r.LEASE),
+    (lambda silence: owner(numbers="a container's", pid=1, alive=silent(silence)), r.LEASE), (lambda silence: "", r.SIGNING),
+], ids=["another host", "unreadable", "hangs here", "hangs in a container", "killed before it had signed"])
+def test_the_lock_of_the_silent_is_taken_over(tmp_path, text, age):
     path = tmp_path / "lock"
-    path.write_text(text())
+    path.write_text(text(age / 2))
     os.utime(path, (time.time() - age / 2,) * 2)
-    with pytest.raises(LockedError), r.locked(tmp_path):
+    with pytest.raises(LockedError, match=rf"last sign of life was {age / 2:.0f} s ago; after 30 minutes"), r.locked(tmp_path):
         pass
-    monkeypatch.setattr(r, "BEAT", 0)
-    with r.locked(tmp_path / "cell") as alive:
-        os.utime(tmp_path / "cell" / "lock", (0, 0))
-        alive()
-        assert (tmp_path / "cell" / "lock").stat().st_mtime > 0         # a sign of life
-        (tmp_path / "cell" / "lock").write_text(owner(pid=1))           # of the thief
-        with pytest.raises(LockedError, match="was lost to another process"):
-            alive()
-    assert json.loads((tmp_path / "cell" / "lock").read_text())["pid"] == 1
+    path.write_text(text(2 * age))
     os.utime(path, (time.time() - 2 * age,) * 2)
     with r.locked(tmp_path):
         assert json.loads(path.read_text())["pid"] == os.getpid()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("error, seen", [(None, None), (FileNotFoundError("it went with the lock"), LockedError)])
+def test_who_has_lost_a_lock_notices(tmp_path, monkeypatch, error, seen):
+    path = tmp_path / "lock"
+    with pytest.raises(seen) if seen else nullcontext(), r.locked(tmp_path) as alive:
+        before = json.loads(path.read_text())["alive"]
+        alive()
+        assert json.loads(path.read_text())["alive"] == before          # half a minute has not passed
+        time.sleep(0.002)
+        alive(at_once=True)
+        assert json.loads(path.read_text())["alive"] > before
+        path.write_text(owner(pid=1))                                   # of the thief
+        for again in range(2):
+            monkeypatch.setattr(r, "BEAT", 0)
+            with pytest.raises(LockedError, match="was lost to another process"):
+                alive(at_once=not again)
+        if error:
+            raise error
+    assert json.loads(path.read_text())["pid"] == 1
 
 
 @pytest.mark.parametrize("text", [lambda: owner(host="elsewhere", pid=1), lambda: "not JSON"],
                          ids=["another host", "unreadable"])
 def test_other_locks_are_respected(tmp_path, text):
-    (tmp_path / "lock").write_text(text())
+    (tmp_path / "lock").write_text(written := text())
     with pytest.raises(LockedError), r.locked(tmp_path):
         pass
-    assert (tmp_path / "lock").read_text() == text()
+    assert (tmp_path / "lock").read_text() == written
 
 
 # ---------------------------------------------------------------- mean and variance of passes

@@ -123,7 +123,7 @@ def test_gains_and_speed_ups_are_over_the_baseline(known):
 
 def test_what_a_cell_does_not_know_is_null(known):
     path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "mean_stderr": None}))
+    path.write_text(json.dumps({**json.loads(path.read_text()), "mean_stderr": None, "digests": {}}))
     assert summarised(known)["rows"][0]["mean_stderr"] is None
 
 
@@ -156,7 +156,7 @@ def test_metrics_take_cells_of_other_versions_but_not_of_other_settings(known):
 def test_cells_say_on_which_cpus_they_were_made(known):
     for seed, cpu in ((4, "Abacus 2"), (7, "Abacus 1"), (5, "Abacus 2")):
         path = known.results.cell_folder("door_ajar", "Slow", seed) / "cell.json"
-        path.write_text(json.dumps({**json.loads(path.read_text()), "machine": {"cpu": cpu}}))
+        path.write_text(json.dumps({**json.loads(path.read_text()), "machine": {"cpu": cpu}, "digests": {}}))
     assert summary.cpus(known.experiment, known.results) == ["Abacus 1", "Abacus 2"]
 
 

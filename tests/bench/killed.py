@@ -1,0 +1,36 @@
+"""`olpm-bench ARGUMENTS`, but what it writes below a folder is counted, and at one of these events it ends as by kill -9.
+
+    python killed.py FOLDER AT COUNT ARGUMENTS...
+
+AT: the number of the event, from 1; 0: none.  COUNT: the file that gets the number of events.  An event is the opening of a file
+for writing, a new folder, a renaming, a removal; it is counted before it happens.
+"""
+import os
+import signal
+import sys
+
+EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link"}
+folder, at, count, *arguments = sys.argv[1:]
+below, at, seen = os.path.abspath(folder) + os.sep, int(at), 0
+
+
+def event(name: str, arguments: tuple) -> None:
+    global seen
+    if name not in EVENTS or not isinstance(arguments[0], str | os.PathLike):
+        return
+    writes = name != "open" or arguments[2] & (os.O_WRONLY | os.O_RDWR)
+    if writes and os.path.abspath(arguments[0]).startswith(below):
+        seen += 1
+        if seen == at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    sys.addaudithook(event)
+    sys.argv = ["olpm-bench", *arguments]
+    from olpm_bench.cli import main
+    try:
+        main()
+    finally:
+        with open(count, "w") as file:
+            file.write(str(seen))
