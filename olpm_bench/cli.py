@@ -22,6 +22,7 @@ from representations._llvm import LLVMError
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 ENDING = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]      # as Ctrl-C
 RESUMED = ("run", "submit", "gate", "reference")
+LONGEST = 1000              # characters of a complaint
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
                   help="Which learnt directional distribution guides a path tracer best?")
@@ -39,7 +40,11 @@ Assignments = Annotated[list[str], typer.Option(
 
 
 def complain(message: str) -> None:
-    print(f"olpm-bench: {' '.join(message.split())}", file=sys.stderr)
+    """One line on stderr; what came from a file can neither steer the terminal nor fill it."""
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(message.split()))
+    if len(line) > LONGEST:
+        line = f"{line[:LONGEST // 2]} ... {line[-LONGEST // 2:]}"
+    print(f"olpm-bench: {line}", file=sys.stderr)
 
 
 def command(body: Callable[..., None]) -> Callable[..., None]:
@@ -95,14 +100,14 @@ def _replacements(texts: list[str] | None) -> dict[str, Path]:
 
 def _load(path: Path, replacements: list[str] | None = None, scale: str | None = None) -> Any:
     """The experiment, at a scale of its own if one is named, with `NAME=PATH` options applied."""
-    from olpm_bench.bench import config
+    from olpm_bench.bench import experiment_file
 
     scenes = _replacements(replacements)
     if path.is_file() and ".py:" in path.read_text(encoding="utf-8", errors="replace"):
         from olpm_bench.bench import environment
 
         environment.select_variant()            # other people's file may name Mitsuba's types when it is imported
-    return config.load(path, scenes, scale)
+    return experiment_file.load(path, scenes, scale)
 
 
 @command
@@ -364,10 +369,12 @@ def fit(representation: Annotated[str, typer.Option(metavar="NAME", show_default
 
     environment.select_variant()
     import representations
+    from olpm_bench.bench import experiment_file
     from olpm_bench.bench import fit as fitting
     from olpm_bench.bench.render_one import settings
     from olpm_bench.bench.results import plain
 
+    experiment_file.announce(representation)
     created = representations.create(representation, **settings(set_, ("representation",))["representation"])
     print(json.dumps(plain(fitting.fit(created, samples, heldout, batches, seed)), allow_nan=False))
 
@@ -386,9 +393,12 @@ def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CL
     from olpm_bench.bench import environment
 
     environment.select_variant()
+    from olpm_bench.bench import experiment_file
     from olpm_bench.bench.render_one import settings
     from olpm_bench.bench.results import plain
     from olpm_bench.check import examination, suite
+
+    experiment_file.announce(representation)
 
     specification = {"type": representation, **settings(set_, ("representation",))["representation"]}
     checks, subject = suite.named(only), suite.Subject(specification, seed, declare)

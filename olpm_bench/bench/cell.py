@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from olpm_bench.bench import environment
+from olpm_bench.bench import environment, probe
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec
 from olpm_bench.bench.metrics import luminance
@@ -57,6 +57,8 @@ def load_scene(spec: CellSpec) -> mi.Scene:
         SceneError: it cannot be used.
     """
     s = spec.scene
+    if s.file is not None:
+        probe.check(s.file, s.arguments)
     return scene_load.load(s.file or s.name, s.arguments, s.width, s.height, spec.integrator.max_depth)
 
 

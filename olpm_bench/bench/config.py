@@ -1,8 +1,7 @@
-"""Experiment files: TOML -> typed, checked, complete descriptions of every cell.
+"""What an experiment is: its tables, typed and checked, and complete descriptions of its cells.
 
-Strict: an unknown key, a wrong type or a value out of range is a :class:`ConfigError` of one line that names the place
-and what is allowed there.  Nothing is rendered here and no scene is loaded; names of representations and of embedded
-scenes are looked up here and nowhere else.
+Strict: an unknown key, a wrong type or a value out of range is an error, which :mod:`olpm_bench.bench.experiment_file` puts into
+one line.  Names of representations and of embedded scenes are looked up in these two modules and nowhere else.
 """
 from __future__ import annotations
 
@@ -13,32 +12,20 @@ import importlib.metadata
 import inspect
 import json
 import os
-import shlex
-import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    PrivateAttr,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 
 import representations
 from olpm_bench import scenes as embedded
 from olpm_bench import transport
 from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
 from olpm_bench.bench.results import SCHEMA_VERSION, slug
-from olpm_bench.bench.scale import scaled
-from olpm_bench.bench.sweep import expanded
-from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, preset_of, with_changes
+from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes
 
 MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see cell.pass_seed
 NO_REFERENCE = Path("none")
@@ -47,6 +34,15 @@ LOOKS = 8                   # methods that the figures' style tells apart
 
 class ConfigError(InputError):
     """A mistake in an experiment file or on the command line; one line that says what is allowed."""
+
+
+def _writable(name: str) -> str:
+    if not name.isprintable() or "$" in name:
+        raise ValueError("must be of printable characters, without $, for it is drawn in figures")
+    return name
+
+
+Label = Annotated[str, AfterValidator(_writable)]
 
 
 class Table(BaseModel):
@@ -59,7 +55,7 @@ class Budget(Table):
     checkpoints: images kept on the way, at log-spaced times (or sample counts); the last is the final image.
     """
     seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
-    spp: int | None = Field(None, ge=1)
+    spp: int | None = Field(None, ge=1, le=2**31)
     checkpoints: int = Field(8, ge=1, le=64)
 
     @model_validator(mode="after")
@@ -82,7 +78,7 @@ class Scene(Table):
     crops: what the figures show enlarged: up to four boxes [x, y, width, height] in pixels, of one shape; by default two where
         the methods differ most.
     """
-    name: str = Field(min_length=1)
+    name: Label = Field(min_length=1)
     file: Path | None = Field(None, strict=False)
     parameters: dict[str, Any] = {}
     overrides: dict[str, Any] = {}
@@ -160,7 +156,7 @@ class Method(Table):
     integrator, training: what differs from the experiment's own tables.
     series: of a method that a ``sweep`` has made, see :mod:`olpm_bench.bench.sweep`.
     """
-    name: str = Field(min_length=1)
+    name: Label = Field(min_length=1)
     representation: dict[str, Any] | None = None
     integrator: dict[str, Any] = {}
     training: dict[str, Any] = {}
@@ -170,6 +166,9 @@ class Method(Table):
     def _sensible(self) -> Method:
         if self.representation is not None and not isinstance(self.representation.get("type"), str):
             raise ValueError(f"representation needs a type; known: {', '.join(representations.names())}")
+        for key, value in self.representation_parameters.items():
+            if isinstance(value, int) and abs(value) >= 2**31:
+                raise ValueError(f"representation: {key} = {value}: must be smaller than 2^31")
         if self.representation is None and self.training:
             raise ValueError("has [training] changes but no representation to train")
         if "max_depth" in self.integrator:
@@ -256,7 +255,7 @@ class Experiment(Table):
     scale: other sizes of it, see :mod:`olpm_bench.bench.scale`.
     """
     schema_version: int = SCHEMA_VERSION
-    title: str
+    title: Label
     description: str = ""
     seeds: list[int] = [0]
     baseline: str | None = None
@@ -308,22 +307,17 @@ class Experiment(Table):
             raise ValueError(f"must be different numbers from 0 to {MAX_SEED}")
         return value
 
-    @model_validator(mode="before")
-    @classmethod
-    def _resolve(cls, data: Any) -> Any:
-        return _without_presets(_without_sweeps(data)) if isinstance(data, dict) else data
-
     @model_validator(mode="after")
     def _distinct(self) -> Experiment:
         for kind, names in (("methods", [m.name for m in self.method]), ("scenes", [s.name for s in self.scene])):
             folders: dict[str, str] = {}
             for name in names:
-                other = folders.setdefault(slug(name), name)
+                other = folders.setdefault(slug(name).lower(), name)
                 if names.count(name) > 1:
                     raise ValueError(f"two {kind} of one name {name!r}; names must differ")
                 if other != name:
-                    raise ValueError(f"{kind} {other!r} and {name!r} would share the folder '{slug(name)}'; names must "
-                                     "differ")
+                    raise ValueError(f"{kind} {other!r} and {name!r} would share the folder '{slug(name)}', at least where "
+                                     "upper case is lower case; names must differ")
         if self.baseline_name not in (known := [m.name for m in self.method]):
             raise ValueError(f"baseline = {self.baseline!r}: no method of this name; known: {', '.join(known)}")
         for number, claim in enumerate(self.claim, 1):
@@ -444,225 +438,10 @@ class Experiment(Table):
         return tomli_w.dumps(_without_none(self.resolved(relative_to)))
 
 
-def _without_sweeps(data: dict[str, Any]) -> dict[str, Any]:
-    """The experiment with every method that sweeps a setting replaced by the methods that it stands for.
-
-    Raises:
-        InputError: by `sweep.expanded`, or a name that is also that of another method.
-    """
-    methods = data.get("method")
-    if not isinstance(methods, list):
-        return data
-    names = [method.get("name") for method in _tables(methods)]
-    for method in _tables(methods):
-        if "sweep" in method and names.count(method.get("name")) > 1:
-            raise InputError(f"two methods of one name {method.get('name')!r}; names must differ")
-    return data | {"method": [m for method in methods for m in (expanded(method) if isinstance(method, dict) else [method])]}
-
-
-def _without_presets(data: dict[str, Any]) -> dict[str, Any]:
-    """The experiment with every `preset` replaced by its values.
-
-    A preset's training settings give way to those beside it, and its integrator settings to those of the table that it
-    belongs to: `[training] preset` to `[integrator]`, a method's own to the method's `integrator`.  Methods without a
-    representation have no preset.
-
-    Raises:
-        InputError: unknown preset.
-    """
-    def table(value: Any) -> dict[str, Any]:
-        return value if isinstance(value, dict) else {}
-
-    training = data.get("training", {})
-    preset = _preset_of(table(training).get("preset", "best"), "[training]")
-    common = {k: v for k, v in preset["integrator"].items() if k not in table(data.get("integrator"))}
-    if isinstance(training, dict):
-        training = preset["training"] | {k: v for k, v in training.items() if k != "preset"}
-    methods = data.get("method")
-    if isinstance(methods, list):
-        methods = [_without_preset(method, common) if table(method).get("representation") is not None else method
-                   for method in methods]
-    return data | {"training": training} | ({"method": methods} if "method" in data else {})
-
-
-def _without_preset(method: dict[str, Any], common: dict[str, Any]) -> dict[str, Any]:
-    """A method with its own preset replaced by its values, or else with the integrator settings `common` to all."""
-    training, integrator = method.get("training", {}), method.get("integrator", {})
-    if isinstance(training, dict) and "preset" in training:
-        preset = _preset_of(training["preset"], f"method {method.get('name')!r} training")
-        start = dataclasses.asdict(TrainingSettings()) | preset["training"]
-        training, common = start | {k: v for k, v in training.items() if k != "preset"}, preset["integrator"]
-    return method | {"training": training, "integrator": common | integrator if isinstance(integrator, dict) else integrator}
-
-
-def _preset_of(name: Any, where: str) -> dict[str, dict[str, Any]]:
-    try:
-        return preset_of(name)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-
-
 def reference_key(scene: Scene, max_depth: int) -> str:
     """Folder of a scene's reference: readable, and different whenever the converged image may differ."""
     digest = _hash({"scene": scene.digest(), "width": scene.width, "height": scene.height, "max_depth": max_depth})
     return f"{slug(scene.name)}-{scene.width}x{scene.height}-{digest[:8]}"
-
-
-def load(path: Path | str, scenes: dict[str, Path] | None = None, scale: str | None = None) -> Experiment:
-    """Read and check an experiment file.
-
-    Args:
-        path: the TOML; the paths in it are relative to its folder.
-        scenes: name of a scene of the file -> XML to use in its place.
-        scale: one of the file's scales; as the file stands by default.
-
-    Raises:
-        ConfigError: anything wrong with the file, with the files it names, or with `scenes`.
-    """
-    path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"experiment file {path}: there is no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"experiment file {path}: cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path.name} is not valid TOML: {error}") from None
-    source = path.name
-    if scale is not None:
-        try:
-            data, source = scaled(data, scale, source), f"{source} --scale {scale}"
-        except InputError as error:
-            raise ConfigError(str(error)) from None
-    experiment = parse(data, source, path.parent, scenes or {})
-    experiment._path, experiment._scale = path, scale
-    return experiment
-
-
-def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Path] | None = None) -> Experiment:
-    """Check what a TOML holds; `source` names it in messages, `folder` is what its paths are relative to.
-
-    Args:
-        scenes: as for :func:`load`; None where there is no option that replaces them.
-
-    Raises:
-        ConfigError: as :func:`load`.
-    """
-    data = _without_paths(data, folder)
-    _replace_scenes(data, scenes or {}, source)
-    try:
-        # As JSON, because there strict means strict and still turns objects into dataclasses.
-        experiment = Experiment.model_validate_json(json.dumps(data), strict=True)
-    except ValidationError as error:
-        raise ConfigError(_explain(error, source)) from None
-    for scene in experiment.scene:
-        _check_scene(scene, source, replaceable=scenes is not None)
-    for method in experiment.method:
-        try:
-            method.create()
-        except representations.RepresentationError as error:
-            raise ConfigError(f"{source} [[method]] {method.name!r}: {error}") from None
-    return experiment
-
-
-def _without_paths(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A copy of `data` in which every path is absolute."""
-    data = json.loads(json.dumps(data, default=str))
-    for scene in _tables(data.get("scene")):
-        for key in ("file", "reference"):
-            if isinstance(scene.get(key), str) and (key, scene[key]) != ("reference", str(NO_REFERENCE)):
-                scene[key] = str((folder / scene[key]).resolve())
-    for method in _tables(data.get("method")):
-        representation = method.get("representation")
-        kind = representation.get("type") if isinstance(representation, dict) else None
-        if isinstance(representation, dict) and isinstance(kind, str) and ".py:" in kind:
-            file, _, attribute = kind.rpartition(":")
-            representation["type"] = f"{(folder / file).resolve()}:{attribute}"
-    return data
-
-
-def _tables(value: Any) -> Iterator[dict[str, Any]]:
-    return (table for table in (value if isinstance(value, list) else []) if isinstance(table, dict))
-
-
-def _replace_scenes(data: dict[str, Any], scenes: dict[str, Path], source: str) -> None:
-    known: dict[Any, dict[str, Any]] = {table.get("name"): table for table in _tables(data.get("scene"))}
-    for name, file in scenes.items():
-        if name not in known:
-            raise ConfigError(f"--scene {name}={file}: no scene '{name}' in {source}; "
-                              f"known: {', '.join(map(str, known))}")
-        known[name]["file"] = str(Path(file).resolve())
-
-
-def _check_scene(scene: Scene, source: str, replaceable: bool) -> None:
-    where = f"{source} [[scene]] {scene.name!r}"
-    hint = f"; --scene {shlex.quote(scene.name)}=PATH points it elsewhere" if replaceable else ""
-    if scene.file is not None:
-        if not scene.file.is_file():
-            raise ConfigError(f"{where}: file {scene.file}: there is no such file{hint}")
-        if scene.parameters:
-            raise ConfigError(f"{where}: parameters belong to embedded scenes; a file takes overrides")
-    else:
-        known = embedded.names()
-        if scene.name not in known:
-            raise ConfigError(f"{where}: unknown scene; known: {', '.join(known)}, or give file = \"scene.xml\"")
-        if scene.overrides:
-            raise ConfigError(f"{where}: overrides belong to files; an embedded scene takes parameters")
-        try:
-            embedded.resolve(scene.name, scene.parameters)
-        except embedded.SceneError as error:
-            raise ConfigError(f"{where}: {error}") from None
-    if scene.reference is not None and scene.has_reference and not scene.reference.exists():
-        raise ConfigError(f"{where}: reference {scene.reference}: there is no such file or folder; \"none\" does without")
-
-
-TABLES = {"budget": Budget, "scene": Scene, "method": Method, "claim": Claim, "sweep": SweepFigure,
-          "integrator": IntegratorSettings, "training": TrainingSettings}
-
-
-UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
-
-
-def _explain(error: ValidationError, source: str) -> str:
-    """The first mistake that pydantic found, in one line."""
-    first: Any = min(error.errors(), key=lambda e: e["type"] not in UNKNOWN)      # a misspelt key is missing, too
-    parts = list(first["loc"])
-    table = parts[0] if parts and parts[0] in TABLES else None
-    cls: Any = TABLES.get(str(table), Experiment)
-    where = source
-    if table is not None and len(parts) > 1 and isinstance(parts[1], int):
-        where, keys = f"{source} [[{table}]] {parts[1] + 1}", parts[2:]
-    elif table is not None:
-        where, keys = f"{source} [{table}]", parts[1:]
-    else:
-        keys = parts
-    if first["type"] in UNKNOWN:
-        known = list(cls.model_fields) if issubclass(cls, BaseModel) else [f.name for f in dataclasses.fields(cls)]
-        if cls is TrainingSettings:
-            known.insert(0, "preset")
-        if cls is Method:
-            known.append("sweep")
-        return f"unknown key '{keys[-1]}' in {where}; known: {', '.join(known)}"
-    if first["type"] in ("missing", "missing_argument"):
-        return f"missing key '{keys[-1]}' in {where}" if keys else f"missing table '{table}' in {source}"
-    if not keys and table is not None and not isinstance(first["input"], dict):     # the table itself is none
-        where, keys = source, [where.removeprefix(source).strip()]
-    if keys and keys[-1] == "float":             # the first of several types: pydantic tells them apart in the path
-        literal = next((e for e in error.errors() if e["loc"][:-1] == first["loc"][:-1] and e["type"] == "literal_error"), None)
-        keys = keys[:-1]
-        first = {**first, "msg": first["msg"] + (f" or {literal['ctx']['expected']}" if literal else "")}
-    name = ".".join(str(k) for k in keys)
-    return f"{where}: {name + ' ' if name else ''}{_plain(first)}"
-
-
-def _plain(error: Any) -> str:
-    """A pydantic error without its vocabulary: the value and what is allowed."""
-    if error["type"] == "value_error":
-        text = str(error["ctx"]["error"])
-        scalar = isinstance(error["input"], (int, float, str)) and text.startswith("must")
-        return f"= {error['input']!r}: {text}" if scalar else text
-    message = error["msg"].replace("Input should be", "must be").replace("an object", "a table")
-    return f"= {error['input']!r}: {message}" if not isinstance(error["input"], dict) else message
 
 
 def _representation_defaults(method: Method) -> dict[str, Any] | None:

@@ -7,7 +7,6 @@ samples at a diffuse vertex that is guided half of the time.
 from __future__ import annotations
 
 import time
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench.transport import npz
 from olpm_bench.transport.settings import InputError
 from representations import square
 from representations import state as states
@@ -111,17 +111,14 @@ def _load(file: Path, *names: str) -> list[np.ndarray]:
     """Arrays of an .npz file, checked and as float64."""
     if not Path(file).is_file():
         raise InputError(f"{file}: there is no such file")
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it holds a single array")
-            missing = [name for name in names if name not in archive.files]
-            if missing:
-                raise InputError(f"no array '{missing[0]}'; it has {', '.join(archive.files) or 'none'}, "
-                                 f"but {', '.join(names)} are needed")
-            arrays = [np.asarray(archive[name], np.float64) for name in names]
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise InputError(f"{file}: not an .npz file of directions: {error}") from error
+    archive = npz.read(file)
+    for name in names:
+        if name not in archive:
+            raise InputError(f"{file}: not an .npz file of directions: no array '{name}'; it has {', '.join(archive) or 'none'}, "
+                             f"but {', '.join(names)} are needed")
+        if archive[name].dtype.kind not in "fiu":
+            raise InputError(f"{file}: not an .npz file of directions: array '{name}' is of type {archive[name].dtype}")
+    arrays = [np.asarray(archive[name], np.float64) for name in names]
     n = len(arrays[0]) if arrays[0].ndim else 0
     for name, array in zip(names, arrays, strict=True):
         shape = (n, 3) if name == "wo" else (n,)

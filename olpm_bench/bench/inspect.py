@@ -165,10 +165,7 @@ def _rooms(spec: CellSpec) -> tuple[tuple[str, ...], Callable[[np.ndarray], np.n
 
 
 def _from_file(scene: mi.Scene, spec: CellSpec, path: Path) -> Learnt:
-    guide = Guide.load(path)
-    if guide.specification.get("type") != spec.method.representation_name:
-        raise ConfigError(f"--guide {spec.method.name}={path} holds a guide of type '{guide.specification.get('type')}', "
-                          f"the method's is '{spec.method.representation_name}'")
+    guide = Guide.load(path, spec.method.representation_name)
     return Learnt(guide, _last_pass(scene, spec, guide), f"read from {path}")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -16,6 +17,8 @@ import numpy as np
 import psutil
 
 import representations
+from olpm_bench import scenes
+from olpm_bench.bench import probe
 from olpm_bench.bench.cell import Kernels
 from olpm_bench.scenes.load import load
 from olpm_bench.transport import settings as options
@@ -38,6 +41,8 @@ def measure(scene: str = "door_ajar", width: int = 160, height: int = 90, spp: i
         spp: samples a pixel of the timed renders.
         passes: training passes with the mixture, of `PARTICLES` and of `CAMERA_PATHS`; at least 3, timed from the third on.
     """
+    if scenes.is_file(scene):
+        probe.check(Path(scene), {})
     loaded = load(scene, width=width, height=height, max_depth=MAX_DEPTH)
     figures: dict[str, Any] = {"scene": scene, "width": width, "height": height, "em_ns_per_particle": em_ns_per_particle()}
     training_passes(loaded, 4)                      # compiles what can be: also what only passes without new records do

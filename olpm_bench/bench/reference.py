@@ -16,16 +16,9 @@ import numpy as np
 from olpm_bench.bench import cell, environment
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec, Experiment
+from olpm_bench.bench.lock import locked
 from olpm_bench.bench.progress import Bar
-from olpm_bench.bench.results import (
-    Accumulator,
-    Reference,
-    ResultError,
-    find_reference,
-    locked,
-    read_reference,
-    write_reference,
-)
+from olpm_bench.bench.results import Accumulator, Reference, ResultError, find_reference, read_reference, write_reference
 from olpm_bench.bench.run import reference_folders
 
 ESTIMATOR = "path, unguided"

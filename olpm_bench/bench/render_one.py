@@ -10,9 +10,11 @@ import mitsuba as mi
 from olpm_bench import scenes
 from olpm_bench.bench import environment
 from olpm_bench.bench.cell import load_scene, measure, warm_up
-from olpm_bench.bench.config import CellSpec, ConfigError, parse
+from olpm_bench.bench.config import CellSpec, ConfigError
+from olpm_bench.bench.experiment_file import parse
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.results import check_writable, replacing, write_exr
+from olpm_bench.bench.run import require_memory
 from olpm_bench.report import records, tonemap
 from olpm_bench.transport.guide import MIN_PARTICLES, Guide
 from olpm_bench.transport.view import records_seen
@@ -44,7 +46,7 @@ def parse_value(text: str) -> Any:
     """``5``, ``0.5``, ``true``, ``[1, 2]``, ``"nearest"`` as TOML reads them; anything else is a string."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):        # also numbers that are too long, and lists too deep
         return text
     return value if isinstance(value, (bool, int, float, str, list)) else text
 
@@ -82,7 +84,7 @@ def cell(scene: str, method: str, assignments: list[str], *, seconds: float | No
     elif tables["representation"] or tables["training"]:
         raise ConfigError("--set training.* and representation.* need a --method with a representation")
     budget = {"seconds": seconds} if seconds is not None else {"spp": spp}
-    data = {"title": f"{scene}, {method}", "seeds": [seed], "budget": budget, "scene": [scene_table],
+    data = {"title": "one image", "seeds": [seed], "budget": budget, "scene": [scene_table],
             "integrator": tables["integrator"], "training": tables["training"], "method": [method_table]}
     return parse(data, "command line", Path.cwd()).cells()[0]
 
@@ -112,6 +114,7 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
             raise ConfigError(f"{path}: there is no folder {path.parent}")
         if path is not None:
             check_writable(path.parent)
+    require_memory([spec])
     guide = _load_guide(load_guide, spec) if load_guide is not None else None
     scene = load_scene(spec)
     with Bar(1.0) as bar:
@@ -139,8 +142,4 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
 def _load_guide(path: Path, spec: CellSpec) -> Guide:
     if not path.is_file():
         raise ConfigError(f"--load-guide {path}: there is no such file")
-    guide = Guide.load(path)
-    if guide.specification.get("type") != spec.method.representation_name:
-        raise ConfigError(f"--load-guide {path} holds a guide of type '{guide.specification.get('type')}', "
-                          f"--method is '{spec.method.representation_name}'")
-    return guide
+    return Guide.load(path, spec.method.representation_name)

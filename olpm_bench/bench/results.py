@@ -26,22 +26,20 @@ import re
 import shutil
 import socket
 import tempfile
-import time
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from olpm_bench.transport.settings import InputError
 
 SCHEMA_VERSION = 1
-LEASE = 1800.0          # [s] without a sign of life after which a lock counts as left behind
-SIGNING = 10.0          # [s] until a lock is signed, at most
-BEAT = 30.0             # [s] between signs of life, at least
+LONGEST_NAME = 80       # of a folder
+DEVICE = r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?"
 
 
 class ResultError(InputError):
@@ -52,13 +50,14 @@ class NewerSchemaError(ResultError):
     """A file of a later version of olpm-bench: read by nobody here, and overwritten by nobody here."""
 
 
-class LockedError(ResultError):
-    """Another process is at work on the cell or reference."""
-
-
 def slug(name: str) -> str:
-    """A name as a folder: letters, digits, dot, dash and underscore."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed"
+    """A name as a folder: letters, digits, dot, dash and underscore, not too many, and none that Windows keeps for devices."""
+    folder = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed"
+    if re.fullmatch(DEVICE, folder, re.IGNORECASE):
+        folder = f"_{folder}"
+    if len(folder) > LONGEST_NAME:
+        folder = f"{folder[:LONGEST_NAME - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return folder
 
 
 # ---------------------------------------------------------------- files
@@ -71,7 +70,7 @@ def replacing(path: Path) -> Iterator[Path]:
         OSError: cannot be written; it names `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{_writer()}.tmp{path.suffix}")
+    beside = path.with_name(f".{path.name}.{writer()}.tmp{path.suffix}")
     try:
         yield beside
         os.replace(beside, path)
@@ -80,10 +79,10 @@ def replacing(path: Path) -> Iterator[Path]:
             error.filename, error.filename2 = str(path), None
         raise
     finally:
-        _clean(lambda: beside.unlink(missing_ok=True))
+        clean_up(lambda: beside.unlink(missing_ok=True))
 
 
-def _clean(remove: Callable[[], None]) -> None:
+def clean_up(remove: Callable[[], None]) -> None:
     """Remove something, also if Ctrl-C comes in the middle."""
     try:
         remove()
@@ -103,20 +102,12 @@ def check_writable(folder: Path) -> None:
         raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
-def _writer() -> str:
+def writer() -> str:
     """Who writes, in the names of unfinished files."""
     return f"{socket.gethostname()}-{os.getpid()}"
 
 
-def remove_unfinished(folder: Path) -> None:
-    """Remove the unfinished files in a folder whose writers were processes of this host and are gone."""
-    for left in folder.glob(f".*.{socket.gethostname()}-*.tmp*"):
-        pid = re.search(r"-(\d+)\.tmp[^-]*$", left.name)
-        if pid is not None and _started(int(pid[1])) is None:
-            _remove(left)
-
-
-def _remove(path: Path) -> None:
+def remove_path(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -243,8 +234,10 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             if index == 0:
                 text, written = part.header.get("olpm_bench", "{}"), part.header.get("olpm_bench_digest")
         header = json.loads(text)
-    except (RuntimeError, ValueError, TypeError, StopIteration, AttributeError) as error:
+    except (RuntimeError, ValueError, TypeError, StopIteration, AttributeError, MemoryError, RecursionError) as error:
         raise ResultError(f"{path} is broken: {str(error) or 'no RGB or Y channel'}") from None
+    if not parts or not isinstance(header, dict) or any(image.ndim != 3 or image.size == 0 for image in parts.values()):
+        raise ResultError(f"{path} is broken: it holds no image")
     if written is not None and written != _digest_of_exr(parts, text):
         raise ResultError(f"{path} is broken: its digest is another")
     return parts, header
@@ -435,7 +428,7 @@ class Results:
             OSError: cannot be written; what was there stays as it was.
         """
         folder = self.cell_folder(scene, method, seed)
-        new = folder / f".cell.{_writer()}.tmp"
+        new = folder / f".cell.{writer()}.tmp"
         info = plain({"schema_version": SCHEMA_VERSION, "scene": scene, "method": method, "seed": seed, **info})
         try:
             write_exr(new / "image.exr", image, config)
@@ -449,7 +442,7 @@ class Results:
             error.filename = str(error.filename).replace(str(new), str(folder))
             raise
         finally:
-            _clean(lambda: shutil.rmtree(new, ignore_errors=True))
+            clean_up(lambda: shutil.rmtree(new, ignore_errors=True))
         (folder / "failed.json").unlink(missing_ok=True)
         return Cell(scene, method, seed, info, trace, folder)
 
@@ -465,174 +458,6 @@ class Results:
         """Say why a cell is not complete.  One of other settings that is there stays."""
         write_json(self.cell_folder(scene, method, seed) / "failed.json",
                    {"schema_version": SCHEMA_VERSION, "scene": scene, "method": method, "seed": seed, "reason": reason})
-
-
-class Alive(Protocol):
-    """A sign of life of who holds a lock, to be given now and then; `at_once` also if the last was a moment ago.
-
-    Raises:
-        LockedError: the lock is lost.
-    """
-    def __call__(self, at_once: bool = False) -> None: ...
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[Alive]:
-    """Hold a folder (of a cell or a reference) while the body runs, by a file `lock` in it.
-
-    Yields what gives signs of life: before the body writes a result it does so at once, as the folder may be another's by then.
-
-    The lock of a process of this host that no longer lives is taken over, and any after half an hour without a sign of life;
-    unfinished files are removed.
-
-    Raises:
-        LockedError: another process holds it, or has taken it over.
-    """
-    path = folder / "lock"
-    folder.mkdir(parents=True, exist_ok=True)
-    me, last = _acquire(path), time.monotonic()
-
-    def is_mine() -> bool:
-        try:
-            return _read_lock(path) == me
-        except FileNotFoundError:
-            return False
-
-    def check() -> None:
-        if not is_mine():
-            raise LockedError(f"{path} was lost to another process, after {time.monotonic() - last:.0f} s without a sign of life")
-
-    def alive(at_once: bool = False) -> None:
-        nonlocal last
-        if not at_once and time.monotonic() - last < BEAT:
-            return
-        check()
-        with path.open("r+b") as file:          # in place, and of the same length: needs no room on the disk
-            file.write(_signed(me))
-        last = time.monotonic()
-
-    try:
-        for left in folder.glob(".*.tmp*"):
-            _remove(left)
-        yield alive
-    except OSError:
-        check()                     # an unfinished file may have gone with the lock
-        raise
-    finally:
-        _clean(lambda: path.unlink(missing_ok=True) if is_mine() else None)
-
-
-def tidy(folder: Path) -> None:
-    """Remove lock and unfinished files of a process that was killed when its work was done."""
-    if (folder / "lock").exists() or any(folder.glob(".*.tmp*")):
-        with suppress(LockedError), locked(folder):
-            pass
-
-
-def _identity() -> dict[str, Any]:
-    """This process.  `boot` tells one run of a machine from another, `numbers` whose process numbers are meant (a container has
-    its own)."""
-    def read(read: Callable[[str], str], name: str) -> str:
-        try:
-            return read(name).strip()
-        except OSError:             # not on Linux
-            return ""
-    return {"pid": os.getpid(), "host": socket.gethostname(), "started": _started(os.getpid()),
-            "boot": read(lambda name: Path(name).read_text(), "/proc/sys/kernel/random/boot_id"),
-            "numbers": read(os.readlink, "/proc/self/ns/pid")}
-
-
-def _started(pid: int) -> float | None:
-    """When a process was started [s], by a clock that nobody sets where there is one; None if it has ended."""
-    try:
-        state, *fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        return None if state in "ZX" else int(fields[18]) / os.sysconf("SC_CLK_TCK")
-    except (FileNotFoundError, ProcessLookupError):
-        import psutil
-        try:
-            return None if Path("/proc/self/stat").exists() else psutil.Process(pid).create_time()
-        except psutil.Error:
-            return None
-
-
-def _signed(owner: dict[str, Any]) -> bytes:
-    """What a lock says: its owner, and the last sign of life [s] by the clock of all processes since the machine started."""
-    return json.dumps({**owner, "alive": f"{time.monotonic():020.3f}"}).encode()
-
-
-def _read_lock(path: Path, alive: bool = False) -> dict[str, Any]:
-    """The owner of a lock, with or without the last sign of life; {} before it has signed.
-
-    Raises:
-        FileNotFoundError: nobody's.
-    """
-    content = path.read_bytes()
-    try:
-        owner = json.loads(content or b"{}")
-        return {key: value for key, value in owner.items() if alive or key != "alive"}
-    except (ValueError, AttributeError):
-        return {"unreadable": content}
-
-
-def _silence(owner: dict[str, Any], path: Path) -> float:
-    """Seconds since a lock's last sign of life; infinite if its owner has ended.
-
-    On one machine nobody's clock counts but the one that cannot be set; between machines, that of the file system.
-    """
-    me = _identity()
-    with suppress(KeyError, TypeError, ValueError):     # of another version
-        if owner["host"] == me["host"]:
-            if owner["boot"] != me["boot"]:
-                return math.inf                         # the machine was started again
-            if owner["numbers"] == me["numbers"] and _started(owner["pid"]) != owner["started"]:
-                return math.inf                         # also if another process has its number now
-            return time.monotonic() - float(owner["alive"])
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".now.", suffix=".tmp") as now:
-        return abs(os.fstat(now.fileno()).st_mtime - path.stat().st_mtime)      # set back, it may be in the future
-
-
-def silence(folder: Path) -> float | None:
-    """Seconds since the last sign of life of who holds a folder, infinite if that process has ended; None if nobody does."""
-    try:
-        return _silence(_read_lock(folder / "lock", alive=True), folder / "lock")
-    except FileNotFoundError:
-        return None
-
-
-def _acquire(path: Path) -> dict[str, Any]:
-    """Create the lock; return its owner, this process."""
-    me = _identity()
-    for _ in range(3):
-        try:
-            handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
-        except FileExistsError:
-            try:
-                owner = _read_lock(path, alive=True)
-                silent = _silence(owner, path)
-            except FileNotFoundError:                   # released meanwhile
-                continue
-            if silent <= (LEASE if owner else SIGNING):
-                who = f"process {owner['pid']} on {owner['host']}" if {"pid", "host"} <= owner.keys() else "somebody unknown"
-                raise LockedError(f"{path} is held by {who}, whose last sign of life was {silent:.0f} s ago; "
-                                  f"after {LEASE / 60:.0f} minutes without one it is taken over") from None
-            aside = path.with_name(f".lock.{_writer()}.tmp")
-            try:
-                os.rename(path, aside)                  # one of those who try this succeeds
-            except FileNotFoundError:
-                continue
-            if _read_lock(aside, alive=True) != owner:  # it lives, or another was faster: put back what was moved
-                with suppress(OSError):
-                    os.link(aside, path)
-            aside.unlink()
-            continue
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(_signed(me))
-        except BaseException:       # a full disk, Ctrl-C
-            path.unlink(missing_ok=True)
-            raise
-        return me
-    raise LockedError(f"{path} is contended")
 
 
 # ---------------------------------------------------------------- references

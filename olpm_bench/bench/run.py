@@ -14,21 +14,11 @@ from olpm_bench.bench import environment
 from olpm_bench.bench.cell import CellFailedError, WarmUp, load_scene, measure, spp_of_pass, warm_up
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.config import CellSpec, Experiment, Scene
+from olpm_bench.bench.lock import LockedError, locked, remove_unfinished, tidy
 from olpm_bench.bench.progress import Bar, is_interrupt, reason
-from olpm_bench.bench.results import (
-    Cell,
-    LockedError,
-    NewerSchemaError,
-    Reference,
-    ResultError,
-    Results,
-    find_reference,
-    locked,
-    read_reference,
-    remove_unfinished,
-    tidy,
-)
+from olpm_bench.bench.results import Cell, NewerSchemaError, Reference, ResultError, Results, find_reference, read_reference
 from olpm_bench.bench.shard import WHOLE, Shard
+from olpm_bench.transport import headroom
 
 LARGER = 8                  # references are averaged down by whole factors up to this
 PATIENCE = 2.0              # [s] between looks at what is in other hands
@@ -80,6 +70,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
     Raises:
         ConfigError: no such scene.
         ResultError: a reference is missing (nothing was run), or a result is of a newer schema.
+        InputError: a cell needs more memory than there is.
         SceneError, OSError: a scene cannot be used; a file cannot be written.
     """
     results, part = Results(root / experiment.stem), experiment.of_scenes(only)
@@ -93,6 +84,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
             tidy(results.cell_folder(spec.scene.name, spec.method.name, spec.seed))
         else:
             todo.append((spec, why))
+    require_memory([spec for spec, _ in todo])
     remove_unfinished(results.folder)
     results.write_text("experiment.toml", experiment.toml(results.folder))
     results.write_json("env.json", environment.describe())
@@ -206,6 +198,16 @@ def memory(spec: CellSpec) -> float:
         single = spec.training.passes if spec.training.schedule == "single_batch" else 1
         particles = 8 * single * (spec.training.photons + spec.training.importons)        # about 8 hits a path
     return (300e6 + 120 * lanes + 100 * particles + pixels * 3 * (8 * 4 + 4 * spec.budget.checkpoints)) / 1e9
+
+
+def require_memory(cells: Sequence[CellSpec]) -> None:
+    """
+    Raises:
+        InputError: one needs more than there is.
+    """
+    for spec in cells:
+        headroom.require(1e9 * memory(spec), f"the paths, particles and images of {spec}",
+                     "a smaller image, fewer photons, importons or checkpoints")
 
 
 def report(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> None:

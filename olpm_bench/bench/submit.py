@@ -14,11 +14,12 @@ from typing import Any
 import submitit
 from submitit.helpers import Checkpointable
 
-from olpm_bench.bench import config, environment
+from olpm_bench.bench import environment, experiment_file
 from olpm_bench.bench.clock import cores
 from olpm_bench.bench.config import ConfigError, Experiment
+from olpm_bench.bench.lock import LEASE, silence
 from olpm_bench.bench.progress import Bar
-from olpm_bench.bench.results import LEASE, Results, silence
+from olpm_bench.bench.results import Results
 
 CLUSTERS = ("slurm", "local")
 POLL = 1.0                  # [s] between looks at local workers
@@ -30,7 +31,7 @@ class Worker(Checkpointable):
 
     Args:
         experiment, root: absolute paths of the TOML and of the `--results` folder.
-        scenes, scale: as for `config.load`.
+        scenes, scale: as for `experiment_file.load`.
         threads: of this worker; all cores by default.
     """
 
@@ -44,7 +45,8 @@ class Worker(Checkpointable):
         from olpm_bench.bench import run
         from olpm_bench.bench.shard import Shard
 
-        return run.run(config.load(self.experiment, self.scenes, self.scale), self.root, shard=Shard(index, count), together=True)
+        loaded = experiment_file.load(self.experiment, self.scenes, self.scale)
+        return run.run(loaded, self.root, shard=Shard(index, count), together=True)
 
 
 def submit(experiment: Experiment, root: Path, cluster: str, workers: int, minutes: int, scenes: dict[str, Path],
@@ -54,7 +56,7 @@ def submit(experiment: Experiment, root: Path, cluster: str, workers: int, minut
     Args:
         cluster: one of `CLUSTERS`.
         minutes: after which a worker is stopped; on Slurm it is started again then, three times.
-        scenes, scale: as for `config.load`.
+        scenes, scale: as for `experiment_file.load`.
         slurm: further parameters of submitit's executor, as `partition` or `constraint`; None is left out.
 
     Raises:

@@ -7,7 +7,7 @@
 """
 from __future__ import annotations
 
-import math
+import sys
 from typing import Any
 
 from olpm_bench.transport.settings import InputError
@@ -49,4 +49,4 @@ def short(value: float) -> str:
 
 
 def _is_positive(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= sys.float_info.max

@@ -27,6 +27,7 @@ import numpy as np
 
 from olpm_bench.transport.settings import InputError
 
+LARGEST = 1e6           # parameter of an embedded scene
 EMBEDDED = ("door_ajar", "living_room", "classroom", "cornell_box")
 
 
@@ -58,8 +59,8 @@ def resolve(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
     for key, value in (changes or {}).items():
         if key not in known:
             raise SceneError(f"scene '{name}' has no parameter '{key}'; known: {', '.join(known) or 'none'}")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise SceneError(f"scene '{name}', parameter {key} = {value!r}: must be a number")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
+            raise SceneError(f"scene '{name}', parameter {key} = {value!r}: must be a number, below {LARGEST:g}")
     values = {key: float((changes or {}).get(key, default)) for key, default in known.items()}
     _module(name).check(**values)
     return values
@@ -123,7 +124,7 @@ def read_xml(path: Path) -> ElementTree.Element:
     Raises:
         SceneError: a missing or unreadable file, or one that is not XML.
     """
-    if not path.is_file():
+    if not (exists(path) and path.is_file()):
         raise SceneError(f"scene file {path}: there is no such file")
     try:
         return ElementTree.parse(path).getroot()
@@ -170,9 +171,18 @@ def _file_content(path: Path, overrides: dict[str, str]) -> list[list[Any]]:
     for element in (e for root in files.values() for e in root.iter("string")):
         name = substitute(element.get("value", ""), values)
         file = path.parent / name
-        if element.get("name") == "filename" or ("." in name and file.is_file()):
-            content.append([name, _sha256(file) if file.is_file() else None])
+        there = exists(file) and file.is_file()
+        if element.get("name") == "filename" or ("." in name and there):
+            content.append([name, _sha256(file) if there else None])
     return content
+
+
+def exists(file: Path) -> bool:
+    """Whether there is such a file; not if there can't be one of that name."""
+    try:
+        return file.exists()
+    except (OSError, ValueError):
+        return False
 
 
 def _sha256(file: Path) -> str:

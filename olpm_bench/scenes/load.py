@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import mitsuba as mi
 
@@ -18,6 +19,7 @@ from olpm_bench.scenes import SceneError
 
 VARIANTS = r"(llvm|cuda)_(ad_)?rgb"
 LARGEST = 1 << 15               # pixels along a side
+DEEPEST = 100                   # elements of an XML inside each other: Mitsuba's parser calls itself for each
 FILM = {"pixel_format": "rgb", "component_format": "float32"}
 
 
@@ -38,6 +40,7 @@ def load(name_or_path: str | Path, parameters: dict[str, Any] | None = None, wid
             out of its range; a variant other than RGB on LLVM or CUDA.
     """
     check_variant()
+    _check_folders(Path(name_or_path).parent if scenes.is_file(name_or_path) else Path())
     for key, size in (("width", width), ("height", height)):
         if size is not None:
             _check_size(key, size)
@@ -56,6 +59,18 @@ def check_variant() -> None:
     """
     if not re.fullmatch(VARIANTS, mi.variant() or ""):
         raise SceneError(f"Mitsuba variant {mi.variant()!r}: must be llvm_ad_rgb or cuda_ad_rgb")
+
+
+def _check_folders(folder: Path) -> None:
+    """Mitsuba looks for its plugins in the folders of the scene and of the process, too.
+
+    Raises:
+        SceneError: there are some, whose code would be run.
+    """
+    for place in {folder.resolve(), Path.cwd()}:
+        for file in place.glob("plugins/*"):
+            if file.suffix in (".so", ".dylib", ".dll"):
+                raise SceneError(f"Mitsuba would run the code of {file} as a plugin; scenes are data: remove it, or go elsewhere")
 
 
 def _check_size(key: str, value: Any) -> None:
@@ -85,6 +100,7 @@ def _from_file(path: Path, parameters: dict[str, Any], width: int | None, height
     if files[path].tag != "scene":
         raise SceneError(f"scene file {path}: its root element is <{files[path].tag}>, must be Mitsuba 3's <scene>")
     known = scenes.xml_parameters(files)
+    _check_text(path, files, {**known, **values})
     for key in parameters:
         if key not in known:
             raise SceneError(f"scene file {path} has no parameter '{key}'; "
@@ -105,13 +121,39 @@ def _from_file(path: Path, parameters: dict[str, Any], width: int | None, height
         parser.transform_merge_equivalent(config, state)
         # Not transform_merge_meshes, as mi.load_file: it orders meshes and their emitters by addresses in memory, so that
         # images differ between processes.  It saves no time of rendering (Veach Ajar, dining-room, classroom).
-        return parser.instantiate(config, state)
+        scene = parser.instantiate(config, state)
+        _check_meshes(path, scene)
+        return scene
     except SceneError:
         raise
     except (RuntimeError, ValueError, TypeError) as error:
         raise SceneError(f"scene file {path}: {_one_line(error)}") from error
     finally:
         mi.set_file_resolver(resolver)  # type: ignore[operator]
+
+
+def _check_text(path: Path, files: dict[Path, ElementTree.Element], values: dict[str, str]) -> None:
+    """Refuse what Mitsuba would run, hang on or crash at before it has parsed anything."""
+    for file, root in files.items():
+        inside, depth = list(root), 1
+        while inside:
+            inside, depth = [grandchild for child in inside for grandchild in child], depth + 1
+        if depth > DEEPEST:
+            raise SceneError(f"scene file {file}: elements inside each other {depth} deep; at most {DEEPEST}")
+        for element in root.iter():
+            kind = scenes.substitute(element.get("type", ""), values)
+            if re.search(r"[/\\.]", kind):
+                raise SceneError(f"scene file {file}: type {kind!r} is the name of no plugin")
+            name = path.parent / scenes.substitute(element.get("value", ""), values)
+            if element.tag == "string" and element.get("name") == "filename" and scenes.exists(name) and not name.is_file():
+                raise SceneError(f"scene file {file}: {name} is no file")
+
+
+def _check_meshes(path: Path, scene: mi.Scene) -> None:
+    for shape in (shape for shape in scene.shapes() if shape.is_mesh()):
+        faces, n = shape.faces_buffer().numpy(), shape.vertex_count()
+        if len(faces) and faces.max() >= n:
+            raise SceneError(f"scene file {path}: a face of shape '{shape.id()}' names vertex {faces.max()} of {n}")
 
 
 def _check_content(path: Path, state: Any) -> None:

@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from olpm_bench.transport import headroom, npz
 from olpm_bench.transport.settings import InputError
 from representations.state import copied, join
 
@@ -40,6 +41,7 @@ CHILDREN = 32
 NEIGHBOURS = 8                  # nearest records among which the best for a cell is sought
 LEAST = 2                       # fewer new cells or records wait: Dr.Jit compiles arrays of one entry to other kernels
 FEW = 100                       # points that are still new after others have been served wait
+SMALLEST_RADIUS = 1e-15         # r_max [scene units], and 1 / the largest
 MOST_CELLS = 2 ** 27            # of a table: 512 MB
 MOST_RECORDS = 2 ** 17
 
@@ -64,9 +66,11 @@ class Grid:
         """
         low, extent = np.array(bbox.min).ravel() - 0.5 * edge, np.array(bbox.extents()).ravel() + edge
         size = np.maximum(np.ceil(extent / edge), 1).astype(int)
-        if 6 * np.prod(size.astype(float)) > MOST_CELLS:
-            raise InputError(f"records of this radius need a table of {6 * np.prod(size.astype(float)):.1g} cells: "
+        n_cells = 6 * np.prod(size.astype(float))
+        if n_cells > MOST_CELLS:
+            raise InputError(f"records of this radius need a table of {n_cells:.1g} cells, {4e-9 * n_cells:.2g} GB: "
                              f"at most {MOST_CELLS:.1g}; make record_radius larger")
+        headroom.require(2 * 4 * n_cells, f"the tables of a cache of {n_cells:.1g} cells", "make record_radius larger")
         opaque = [dr.opaque(mi.Float, float(x)) for x in low], [dr.opaque(mi.UInt32, int(x)) for x in size]
         return Grid(mi.Point3f(opaque[0]), dr.opaque(mi.Float, 1 / edge), mi.Vector3u(opaque[1]), 6 * int(np.prod(size)))
 
@@ -140,6 +144,8 @@ class RecordCache:
     def __init__(self, bbox: mi.ScalarBoundingBox3f, record_radius: float) -> None:
         self.bbox, self.record_radius = bbox, record_radius
         self.radius = record_radius * float(dr.norm(bbox.extents()))         # r_max [scene units]
+        if not SMALLEST_RADIUS < self.radius < 1 / SMALLEST_RADIUS:
+            raise InputError(f"records of radius {self.radius:.2g}: scenes must be of a size whose square float32 can hold")
         self.grid = Grid.over(bbox, CELL * self.radius)
         self.table = dr.full(mi.UInt32, MISSING, self.grid.n_cells)  # [n_cells + CHILDREN * blocks]
         self.n_roots = dr.opaque(mi.UInt32, self.grid.n_cells)
@@ -338,17 +344,52 @@ class RecordCache:
 
     @staticmethod
     def from_numpy(arrays: dict[str, Any]) -> RecordCache:
-        """The cache that `to_numpy` described."""
-        bbox = mi.ScalarBoundingBox3f(*(mi.ScalarPoint3f(*map(float, corner)) for corner in arrays["bbox"]))
-        cache = RecordCache(bbox, float(arrays["record_radius"]))
-        cache.points, cache.radii = arrays["points"], arrays["radii"]
-        cache.cells = Cells(**{name: arrays[f"cells_{name}"] for name in vars(cache.cells)})
+        """The cache that `to_numpy` described.
+
+        Raises:
+            ValueError: nothing that it describes; InputError: its table would be too large.
+        """
+        bounds, record_radius = npz.checked(arrays, "bbox", np.float32, 2, 3), float(arrays["record_radius"])
+        npz.require(np.isfinite(bounds).all() and (bounds[0] <= bounds[1]).all() and (bounds[0] < bounds[1]).any(), "bbox")
+        npz.require(0 < record_radius <= 0.25, "record_radius")
+        bbox = mi.ScalarBoundingBox3f(*(mi.ScalarPoint3f(*map(float, corner)) for corner in bounds))
+        cache = RecordCache(bbox, record_radius)
+        n, m = len(arrays["points"]), len(arrays["cells_slot"])
+        cache.points = npz.checked(arrays, "points", np.float32, n, 6)
+        cache.radii = npz.checked(arrays, "radii", np.float32, n)
+        cache.cells = Cells(**{name: npz.checked(arrays, f"cells_{name}", field.dtype, m, *field.shape[1:])
+                               for name, field in vars(cache.cells).items()})
+        npz.require(n <= MOST_RECORDS and np.isfinite(cache.points).all(), "points")
+        npz.require(((cache.radii > 0) & (cache.radii <= 1.001 * cache.radius)).all(), "radii")
         if len(cache):
-            table = np.full(int(arrays["table_size"]), MISSING, np.uint32)
-            table[arrays["table_used"]] = arrays["table_entries"]
+            table = cache._stored_table(arrays)
+            cells = cache.cells
+            npz.require((cells.slot < len(table)).all() and (cells.level <= LEVELS).all() and (cells.record < n).all()
+                        and np.isfinite(cells.point).all(), "cells")
             cache.table = copied(mi.UInt32, table)
             cache._assign(np.zeros(len(cache.cells), bool))
         return cache
+
+
+    def _stored_table(self, arrays: dict[str, Any]) -> np.ndarray:
+        """The table that `to_numpy` described, if all that look-ups read in it exists."""
+        size, roots, k = int(arrays["table_size"]), self.grid.n_cells, len(arrays["table_used"])
+        used = npz.checked(arrays, "table_used", np.uint32, k)
+        entries = npz.checked(arrays, "table_entries", np.uint32, k)
+        blocks = (size - roots) // CHILDREN
+        npz.require(0 <= blocks <= MOST_CELLS // CHILDREN and size == roots + CHILDREN * blocks, "table_size")
+        npz.require((used < size).all(), "table_used")
+        split = entries >= SPLIT
+        npz.require((entries[split] ^ SPLIT < blocks).all(), "table_entries")
+        npz.require((entries[~split] & (UNKNOWN - 1) < len(self)).all(), "table_entries")
+        table = np.full(size, MISSING, np.uint32)
+        table[used] = entries
+        read = table[:roots]
+        for _ in range(LEVELS + 1):
+            below = np.unique(read[read >= SPLIT]) ^ SPLIT
+            read = table[roots:].reshape(blocks, CHILDREN)[below].ravel()
+        npz.require(len(read) == 0, "table_entries")              # cells are split so often at most
+        return table
 
 
 def _nearest(points: np.ndarray, queries: np.ndarray, k: int, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

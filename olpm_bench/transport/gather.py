@@ -109,7 +109,7 @@ def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: m
     finite = dr.all(dr.isfinite(batch.weight))
     dr.eval(batch, finite)
     if not finite:
-        raise InputError("particles of infinite weight: check the reflectances of the scene's surfaces")
+        raise InputError("particles of infinite weight: check the scene's emitters, and the reflectances of its surfaces")
     return batch
 
 

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 import representations
-from olpm_bench.transport import radius
+from olpm_bench.transport import headroom, npz, radius
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.estimates import ENOUGH, Estimates
 from olpm_bench.transport.roulette import PixelEstimate
@@ -109,6 +108,9 @@ class Guide:
         """Add records where the points have none: what the record beside them has learnt, if it has the same frame."""
         before, added = self.records, self.cache.grow(p, n, active)
         if added:
+            each = self.bytes_per_record if before else states.bytes_of(self.representation.init(2, 0, self.parallax)) / 2
+            headroom.require((2 * before + added) * each, f"{before + added} records of {each:.0f} bytes",
+                         "make record_radius larger, or the representation smaller")
             self.state = states.append(self.state, self.representation.init(added, seed, self.parallax))
             self.count = states.join(self.count, dr.zeros(mi.UInt32, added))
             self.estimates = states.append(self.estimates, Estimates.nothing(added))
@@ -196,33 +198,58 @@ class Guide:
             np.savez_compressed(file, **arrays)         # type: ignore[arg-type]
 
     @staticmethod
-    def load(path: str | Path) -> Guide:
+    def load(path: str | Path, representation: str | None = None) -> Guide:
         """Read a guide.
 
+        Args:
+            representation: the type that it must be of.  FILE.py:Class, whose code is then run, must be given.
+
         Raises:
-            InputError: not a whole guide file, or one of a newer format.
+            InputError: not a whole guide file, one of a newer format, or of another type.
             OSError: it can't be read.
         """
         def part(prefix: str) -> dict[str, np.ndarray]:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
+        arrays = npz.read(path)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)
             meta = json.loads(str(arrays["meta"]))
             if meta["format"] != FORMAT:
                 raise InputError(f"{path}: guide format {meta['format']}, this version reads {FORMAT}; train again")
-            guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"], meta["fraction"], meta["parallax"])
-            guide.state = states.from_numpy(guide.state, part("state."))
-            guide.estimates = states.from_numpy(guide.estimates, part("estimates."))
-            guide.pixels = PixelEstimate(arrays["pixels"]) if "pixels" in arrays else None
-            guide.count, guide.particles = mi.UInt32(arrays["count"]), meta["particles"]
+            kind, fraction, parallax, particles = (meta["representation"]["type"], meta["fraction"], meta["parallax"],
+                                                   meta["particles"])
+            if representation is not None and kind != representation:
+                raise InputError(f"{path} holds a guide of type '{kind}', not '{representation}'")
+            if representation is None and ".py:" in kind:
+                raise InputError(f"{path} holds a guide of type '{kind}', whose code is run only if Guide.load is told this type")
+            if not ((fraction is None or 0 < fraction <= 1) and isinstance(parallax, bool) and isinstance(particles, int)):
+                raise ValueError("meta")
+            guide = Guide(RecordCache.from_numpy(part("cache.")), meta["representation"], fraction, parallax)
+            guide.state = _stored(part("state."), guide.representation.init(2, 0, parallax), guide.records)
+            guide.estimates = _stored(part("estimates."), Estimates.nothing(2), guide.records)
+            if "pixels" in arrays:
+                h, w = arrays["pixels"].shape
+                npz.require(np.isfinite(npz.checked(arrays, "pixels", np.float32, h, w)).all() and h * w > 0, "pixels")
+                guide.pixels = PixelEstimate(arrays["pixels"])
+            guide.count, guide.particles = mi.UInt32(npz.checked(arrays, "count", np.uint32, guide.records)), particles
             guide._tabulate()
             return guide
-        except (FileNotFoundError, PermissionError, IsADirectoryError, InputError, representations.RepresentationError):
-            raise
-        except (ValueError, TypeError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: not a whole guide file (.npz as written by Guide.save)") from error
+        except (InputError, representations.RepresentationError) as error:
+            raise InputError(f"{'' if str(path) in str(error) else f'{path}: '}{error}") from error
+        except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
+            raise InputError(f"{path}: not a whole guide file (.npz as written by Guide.save): {error}") from error
 
     def __repr__(self) -> str:
         return f"Guide[{self.specification}, {self.records} records ({self.trained:.0%} trained), {self.particles} particles]"
+
+
+def _stored(arrays: dict[str, np.ndarray], like: Any, n_records: int) -> Any:
+    """The state of so many records that is in a file; `like` is one of two records.
+
+    Raises:
+        ValueError: it is of other types or sizes.
+    """
+    for f in fields(like):
+        two = getattr(like, f.name).numpy()
+        npz.checked(arrays, f.name, two.dtype, n_records * (len(two) // 2))
+    return states.from_numpy(like, arrays)

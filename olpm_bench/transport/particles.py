@@ -20,6 +20,7 @@ import numpy as np
 
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.headroom import require
 from olpm_bench.transport.settings import InputError
 from olpm_bench.transport.window import HEAVIEST, HIGH, LEAST_SURVIVAL, LIGHTEST, LOW, Window
 
@@ -179,6 +180,7 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
     rows = 2 * hits * each
     if 4 * rows * lanes >= 2 ** 32:
         raise InputError(f"{n_paths} particles of up to {2 * hits} hits in one trace: at most {(2 ** 32 - 1) // (8 * hits)}")
+    require(3 * 16 * rows * lanes, f"{n_paths} particles of up to {2 * hits} hits in one trace", "trace fewer")
     photons = mode == mi.TransportMode.Importance
     ctx = mi.BSDFContext(mode)
     position, direction, normal = (dr.empty(mi.Float, 4 * rows * lanes) for _ in range(3))

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, TypeVar
 
 from representations import wrong_type
 
+MOST = 2 ** 31 - 1                  # of whole numbers, which become 32-bit ones
 STRICT = {"extra": "forbid"}        # read by pydantic: unknown keys are errors
 
 
@@ -53,10 +54,10 @@ class IntegratorSettings:
 
     def __post_init__(self) -> None:
         _require_types(self)
-        _require(self.max_depth >= 1 or self.max_depth == -1, "max_depth", self.max_depth, ">= 1, or -1 for no limit")
+        _require(1 <= self.max_depth <= MOST or self.max_depth == -1, "max_depth", self.max_depth, ">= 1, or -1 for no limit")
         _require_choice(self, "roulette", "contribution", "throughput", "none")
         _require(self.max_depth >= 1 or self.roulette != "none", "max_depth", self.max_depth, ">= 1 without roulette")
-        _require(self.rr_depth >= 1, "rr_depth", self.rr_depth, ">= 1")
+        _require(1 <= self.rr_depth <= MOST, "rr_depth", self.rr_depth, ">= 1")
         _require(0 < self.window < math.inf, "window", self.window, "> 0")
         _require(0 < self.fraction <= 1, "fraction", self.fraction, "in (0, 1]")
 
@@ -121,9 +122,9 @@ class TrainingSettings:
         _require_choice(self, "emission", "guided", "emitter")
         _require_choice(self, "weight_window", "flux", "contribution")
         for name in ("passes", "importons", "camera_passes"):
-            _require(getattr(self, name) >= 0, name, getattr(self, name), ">= 0")
+            _require(0 <= getattr(self, name) <= MOST, name, getattr(self, name), f">= 0, at most {MOST}")
         for name in ("photons", "camera_paths", "neighbours"):
-            _require(getattr(self, name) >= 1, name, getattr(self, name), ">= 1")
+            _require(1 <= getattr(self, name) <= MOST, name, getattr(self, name), f">= 1, at most {MOST}")
         number = isinstance(self.share, int | float) and not isinstance(self.share, bool)
         _require(self.share == "auto" or (number and 0 < self.share <= 1), "share", self.share, "in (0, 1], or 'auto'")
         _require(0 < self.record_radius <= 0.25, "record_radius", self.record_radius, "in (0, 0.25] of the scene's diagonal")

@@ -142,7 +142,7 @@ class Training:
         check_traceable(scene)
         self.scene, self.settings, self.max_depth, self.seed = scene, settings, integrator.max_depth, seed
         specification = {"type": representation} if isinstance(representation, str) else dict(representation)
-        bounds = surface_bounds(scene)
+        self.bounds = bounds = surface_bounds(scene)
         self.radiance = Guide(RecordCache(bounds, settings.record_radius), specification,
                               integrator.fraction if settings.learn_fraction else None, settings.parallax,
                               settings.learn_direct)
@@ -169,7 +169,14 @@ class Training:
     def run(self) -> Iterator[PassStatistics]:
         """Train as the settings say, one pass at each step.  Who stops early has a guide as good as the passes done."""
         for index, step in enumerate(self.steps):
-            yield step(PassStatistics(index, self.passes))
+            yield step(PassStatistics(index, self.passes, warnings=self._out_of_scale() if index == 0 else []))
+
+    def _out_of_scale(self) -> list[str]:
+        """What to tell of a scene that is tiny, or far from the origin, for Mitsuba's and our float32."""
+        moved = mi.math.RayEpsilon * (1 + float(np.abs([self.bounds.min, self.bounds.max]).max()))
+        radius = self.radiance.cache.radius
+        return [] if moved < radius else [f"Mitsuba starts rays {moved:.1g} units off surfaces, farther than records reach, "
+                                          f"{radius:.1g}: make the scene larger, or move it to the origin"]
 
     @property
     def passes(self) -> int:
@@ -270,8 +277,9 @@ class Training:
             with _Seconds(statistics, "gather"):
                 batch = binned(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
-            with _Seconds(statistics, "update"):
-                guide.learn_camera(batch, *paths.returned(place), offset, self._next_seed())
+            if len(place):          # a record serves some of them
+                with _Seconds(statistics, "update"):
+                    guide.learn_camera(batch, *paths.returned(place), offset, self._next_seed())
             statistics.kept = len(batch)
             if len(batch):
                 statistics.seen = float(np.mean(guide.count.numpy()[batch.count().numpy() > 0]))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_experiment import TOML
 
-from olpm_bench.bench import cell, config
+from olpm_bench.bench import cell, config, experiment_file
 from olpm_bench.bench.cell import CellFailedError, WarmUp
 from olpm_bench.bench.clock import Lap
 from olpm_bench.bench.config import Experiment
@@ -21,7 +21,7 @@ from olpm_bench.transport.training import PassStatistics
 @pytest.fixture
 def experiment(tmp_path) -> Experiment:
     (tmp_path / "test.toml").write_text(TOML)
-    return config.load(tmp_path / "test.toml")
+    return experiment_file.load(tmp_path / "test.toml")
 
 
 def test_a_cell_spends_its_samples_and_repeats_bit_for_bit(experiment):
@@ -44,7 +44,7 @@ def test_a_cell_spends_its_samples_and_repeats_bit_for_bit(experiment):
 def test_the_variance_layer_agrees_with_the_spread_over_seeds(tmp_path, monkeypatch):
     """Mean over pixels of 30 images' squared standard errors against their variance: ratio within 15 %."""
     (tmp_path / "test.toml").write_text(TOML.replace("seeds = 2", "seeds = 30").replace("spp = 11", "spp = 64"))
-    specs = [s for s in config.load(tmp_path / "test.toml").cells() if s.method.name == "Path tracing"]
+    specs = [s for s in experiment_file.load(tmp_path / "test.toml").cells() if s.method.name == "Path tracing"]
     monkeypatch.setattr(cell, "PASSES", 4)
     scene = cell.load_scene(specs[0])
     done = [cell.measure(s, scene, WarmUp(0.0, 1.0)) for s in specs]
@@ -58,7 +58,7 @@ def test_training_is_counted_apart(experiment):
     text = TOML + 'representation = { type = "cosine" }\n'
     text += "training = { passes = 1, photons = 500, importons = 100, camera_passes = 0 }\n"
     experiment.path.write_text(text)
-    spec = config.load(experiment.path).cells()[1]
+    spec = experiment_file.load(experiment.path).cells()[1]
     scene = cell.load_scene(spec)
     done = cell.measure(spec, scene, cell.warm_up(spec, scene))
     assert done.info["train_seconds"] > 0 and done.info["records"] == done.guide.records > 0
@@ -70,7 +70,7 @@ def test_training_is_counted_apart(experiment):
 def test_a_budget_of_seconds_stops_at_the_first_pass_past_it(experiment, monkeypatch):
     """With a clock that says 0.1 s a pass."""
     experiment.path.write_text(TOML.replace("spp = 11", "seconds = 1"))
-    spec = config.load(experiment.path).cells()[0]
+    spec = experiment_file.load(experiment.path).cells()[0]
 
     class Ticks(cell.Clock):
         ticks = 0
@@ -145,7 +145,7 @@ def trained(experiment, monkeypatch):
     def measured(budget: str, training: str, spp_seconds: float = 0.5):
         text = TOML.replace("spp = 11", budget) + f'representation = {{ type = "cosine" }}\ntraining = {{ {training} }}\n'
         experiment.path.write_text(text)
-        return cell.measure(config.load(experiment.path).cells()[1], None, WarmUp(0.0, spp_seconds))
+        return cell.measure(experiment_file.load(experiment.path).cells()[1], None, WarmUp(0.0, spp_seconds))
 
     monkeypatch.setattr(cell, "Clock", Ticking)
     monkeypatch.setattr(cell, "Training", Passes)

@@ -50,7 +50,7 @@ def process(*arguments: object, **environment: str) -> subprocess.CompletedProce
 
 def complaint(result) -> str:
     """The one line of a refusal."""
-    lines = result.stderr.splitlines()
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("olpm-bench: runs the code of ")]
     assert (getattr(result, "exit_code", None) or getattr(result, "returncode", None)) == 2, result.stderr
     assert len(lines) == 1 and lines[0].startswith("olpm-bench: "), result.stderr
     return lines[0]
@@ -58,11 +58,11 @@ def complaint(result) -> str:
 
 @pytest.fixture
 def experiment(tmp_path) -> Path:
-    from olpm_bench.bench import config
+    from olpm_bench.bench import experiment_file
 
     path = tmp_path / "test.toml"
     path.write_text(TOML)
-    loaded = config.load(path)
+    loaded = experiment_file.load(path)
     grey = np.full((36, 48, 3), 0.5, np.float32)
     reference = Reference(grey, grey + 0.01, grey, grey, {"spp_a": 1, "spp_b": 1})
     write_reference(tmp_path / "results" / "references" / loaded.reference_key(loaded.scene[0]), reference)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from olpm_bench.bench import config
+from olpm_bench.bench import config, experiment_file
 from olpm_bench.bench.config import ConfigError
 
 MINIMAL = """
@@ -33,7 +33,7 @@ XML = '<scene version="3.0.0"><default name="resx" value="4"/></scene>'
 def load(tmp_path: Path, text: str, **arguments) -> config.Experiment:
     file = tmp_path / "test.toml"
     file.write_text(text)
-    return config.load(file, **arguments)
+    return experiment_file.load(file, **arguments)
 
 
 def message(tmp_path: Path, text: str, **arguments) -> str:
@@ -112,7 +112,7 @@ def test_a_scene_may_do_without_a_reference(tmp_path):
     folder.mkdir()
     assert tomllib.loads(experiment.toml(folder))["scene"][0]["reference"] == "none"
     (folder / "again.toml").write_text(experiment.toml(folder))
-    assert not config.load(folder / "again.toml").scene[0].has_reference
+    assert not experiment_file.load(folder / "again.toml").scene[0].has_reference
     assert [c.key for c in experiment.cells()] == [c.key for c in load(tmp_path, MINIMAL).cells()]
 
 
@@ -209,7 +209,7 @@ def test_the_hint_names_an_option_only_where_there_is_one(tmp_path):
             "scene": [{"name": "a room", "file": "no.xml", "width": 4, "height": 4}]}
     for scenes, hinted in ((None, False), ({}, True)):
         with pytest.raises(ConfigError, match="no such file") as error:
-            config.parse(data, "command line", tmp_path, scenes)
+            experiment_file.parse(data, "command line", tmp_path, scenes)
         assert ("--scene 'a room'=PATH" in str(error.value)) == hinted
 
 
@@ -232,10 +232,10 @@ def test_our_own_code_is_that_of_cells_transport_and_representations(monkeypatch
 
 def test_a_missing_file_and_one_that_is_no_text(tmp_path):
     with pytest.raises(ConfigError, match=r"nothing\.toml: there is no such file"):
-        config.load(tmp_path / "nothing.toml")
+        experiment_file.load(tmp_path / "nothing.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="cannot be read"):
-        config.load(tmp_path / "binary.toml")
+        experiment_file.load(tmp_path / "binary.toml")
 
 
 def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
@@ -264,7 +264,7 @@ def test_the_resolved_file_describes_the_same_cells(tmp_path):
     folder = tmp_path / "results" / "test"
     folder.mkdir(parents=True)
     (folder / "experiment.toml").write_text(experiment.toml(folder))
-    again = config.load(folder / "experiment.toml")
+    again = experiment_file.load(folder / "experiment.toml")
     assert [c.key for c in again.cells()] == [c.key for c in experiment.cells()]
     assert again.scene[0].crops == [[1, 2, 8, 4]] and again.of_results(folder).path == Path("test.toml")
     resolved = tomllib.loads(experiment.toml())

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from olpm_bench.bench import config, run
+from olpm_bench.bench import config, experiment_file, run
 from olpm_bench.transport import settings
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments"
@@ -22,7 +22,7 @@ def of_this_project(tmp_path: Path, name: str, scale: str | None = None) -> conf
     scene = table.get("scale", {}).get(scale, {}).get("scene")
     names = [s["name"] for s in scene] if isinstance(scene, list) else [s["name"] for s in table["scene"]]
     scenes = [s["name"] for s in table["scene"] if "file" in s and s["name"] in names]
-    return config.load(FOLDER / name, dict.fromkeys(scenes, tmp_path / "room.xml"), scale)
+    return experiment_file.load(FOLDER / name, dict.fromkeys(scenes, tmp_path / "room.xml"), scale)
 
 
 SCALES = [(name, scale) for name, table in FILES.items() for scale in (None, *table.get("scale", {}))]
@@ -86,7 +86,7 @@ def test_who_guides_whom_is_compared_with_as_many_particles(tmp_path, scale):
 
 
 def test_the_committed_reference_keeps_its_key():
-    quickstart = config.load(FOLDER / "quickstart.toml")
+    quickstart = experiment_file.load(FOLDER / "quickstart.toml")
     assert quickstart.reference_key(quickstart.scene[0]) == "door_ajar-96x54-075c0ded"
 
 

@@ -19,10 +19,11 @@ import pytest
 from small_experiment import TOML
 from typer.testing import CliRunner
 
-from olpm_bench.bench import config, submit
+from olpm_bench.bench import config, lock, submit
 from olpm_bench.bench import results as r
 from olpm_bench.bench.clock import Clock
-from olpm_bench.bench.results import LockedError, Reference, ResultError, Results
+from olpm_bench.bench.lock import LockedError
+from olpm_bench.bench.results import Reference, ResultError, Results
 from olpm_bench.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -120,7 +121,8 @@ import resource, sys
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 from test_faults import NAMES, files, write_cell
-from olpm_bench.bench.results import Results, locked
+from olpm_bench.bench.lock import locked
+from olpm_bench.bench.results import Results
 for disk in sys.argv[3:]:
     if sys.argv[2] == "limited":
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(disk) * 64, resource.RLIM_INFINITY))
@@ -199,7 +201,7 @@ def test_no_step_of_the_clock_frees_a_lock(tmp_path, monkeypatch):
     """A day forwards and backwards, as the system's time, the files' and the start of the machine say it."""
     import psutil
 
-    with r.locked(tmp_path):
+    with lock.locked(tmp_path):
         for days in (-1, 1, 400):
             with monkeypatch.context() as jump:
                 now, boot = time.time(), psutil.boot_time()
@@ -207,7 +209,7 @@ def test_no_step_of_the_clock_frees_a_lock(tmp_path, monkeypatch):
                 jump.setattr(psutil, "boot_time", lambda boot=boot, days=days: boot + 86400 * days)
                 os.utime(tmp_path / "lock", (now - 86400 * days,) * 2)
                 with pytest.raises(LockedError, match=f"held by process {os.getpid()} on .* whose last sign of life was 0 s ago"):
-                    r.locked(tmp_path).__enter__()
+                    lock.locked(tmp_path).__enter__()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -250,9 +252,9 @@ def test_a_clock_that_stands_still_charges_nothing(monkeypatch):
 HOLD = """
 import sys, time
 from pathlib import Path
-from olpm_bench.bench import results as r
-r.BEAT = 0
-with r.locked(Path(sys.argv[1])) as alive:
+from olpm_bench.bench import lock
+lock.BEAT = 0
+with lock.locked(Path(sys.argv[1])) as alive:
     print("held", flush=True)
     while True:
         alive()
@@ -266,14 +268,14 @@ def test_who_hangs_loses_the_lock_and_notices(tmp_path, monkeypatch):
     try:
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(LockedError, match=f"held by process {holder.pid} "):
-            r.locked(tmp_path).__enter__()
+            lock.locked(tmp_path).__enter__()
         holder.send_signal(signal.SIGSTOP)
-        while r.silence(tmp_path) < 0.3:
+        while lock.silence(tmp_path) < 0.3:
             time.sleep(0.05)
         with pytest.raises(LockedError, match="after 30 minutes without one it is taken over"):
-            r.locked(tmp_path).__enter__()
-        monkeypatch.setattr(r, "LEASE", 0.2)
-        with r.locked(tmp_path):
+            lock.locked(tmp_path).__enter__()
+        monkeypatch.setattr(lock, "LEASE", 0.2)
+        with lock.locked(tmp_path):
             holder.send_signal(signal.SIGCONT)
             _, errors = holder.communicate(timeout=60)
             assert "lock was lost to another process" in errors.splitlines()[-1]
@@ -290,8 +292,8 @@ def test_a_zombie_holds_nothing(tmp_path):
     assert holder.stdout.readline() == "held\n"
     holder.kill()
     os.waitid(os.P_PID, holder.pid, os.WEXITED | os.WNOWAIT)
-    assert r.silence(tmp_path) == math.inf
-    with r.locked(tmp_path):
+    assert lock.silence(tmp_path) == math.inf
+    with lock.locked(tmp_path):
         pass
     holder.communicate()
 
@@ -306,7 +308,7 @@ def test_who_has_lost_a_cell_does_not_write_it(tmp_path, monkeypatch):
     def hangs(spec, *arguments, **options):
         done = measure(spec, *arguments, **options)
         if str(spec) == "cornell_box / Roulette / seed 1":
-            (folder / "lock").write_bytes(r._signed({**r._identity(), "pid": 1}))       # of the thief
+            (folder / "lock").write_bytes(lock._signed({**lock._identity(), "pid": 1}))       # of the thief
         return done
     monkeypatch.setattr(run, "measure", hangs)
     (problem,) = run.run(loaded, tmp_path / "results")
@@ -333,7 +335,7 @@ class Job:
         return self.answer
 
 
-@pytest.mark.parametrize("jobs, silent", [([Job(), Job([])], 0.0), ([Job(), Job()], 2 * r.LEASE)],
+@pytest.mark.parametrize("jobs, silent", [([Job(), Job([])], 0.0), ([Job(), Job()], 2 * lock.LEASE)],
                          ids=["another has found all complete", "nobody shows a sign of life"])
 def test_workers_that_hang_are_stopped(tmp_path, monkeypatch, jobs, silent, capfd):
     (tmp_path / "test.toml").write_text(TOML)
@@ -341,7 +343,7 @@ def test_workers_that_hang_are_stopped(tmp_path, monkeypatch, jobs, silent, capf
     folder = Results(tmp_path / "test").cell_folder("cornell_box", "Roulette", 1)
     folder.mkdir(parents=True)
     now = time.monotonic()
-    (folder / "lock").write_bytes(r._signed({**r._identity(), "numbers": "a container's"}))
+    (folder / "lock").write_bytes(lock._signed({**lock._identity(), "numbers": "a container's"}))
     monkeypatch.setattr(submit.time, "monotonic", lambda: now + silent + submit.POLL * len(slept))
     monkeypatch.setattr(submit.time, "sleep", slept.append)
     submit.wait(jobs, loaded, tmp_path)
@@ -355,7 +357,7 @@ def test_whom_a_worker_waits_for_is_shown(tmp_path, monkeypatch):
     from olpm_bench.bench import progress, run
 
     (tmp_path / "test.toml").write_text(SHORT)
-    other = r.locked(Results(tmp_path / "results" / "test").cell_folder("cornell_box", "Roulette", 0))
+    other = lock.locked(Results(tmp_path / "results" / "test").cell_folder("cornell_box", "Roulette", 0))
     other.__enter__()
     shown: list[str] = []
     monkeypatch.setattr(progress.Bar, "at", lambda bar, done, label: shown.append(label))
@@ -401,11 +403,11 @@ def test_ctrl_c_at_any_write_leaves_the_old_cell_or_the_new_one(tmp_path):
     results, outcomes = Results(tmp_path), []
     INTERRUPT_AT["below"] = str(tmp_path)
     for at in range(1, 1000):
-        with r.locked(results.cell_folder(*NAMES)):
+        with lock.locked(results.cell_folder(*NAMES)):
             write_cell(results, seed=0)
         INTERRUPT_AT["left"] = at
         try:
-            with r.locked(results.cell_folder(*NAMES)) as alive:
+            with lock.locked(results.cell_folder(*NAMES)) as alive:
                 alive(at_once=True)
                 write_cell(results, seed=1)
         except KeyboardInterrupt:
@@ -486,7 +488,7 @@ def test_unfinished_files_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
     kept = [f".summary.json.{host}-{os.getpid()}.tmp.json", ".env.json.elsewhere-1.tmp.json", "notes.tmp"]
     for name in left + kept:
         (tmp_path / name).touch()
-    r.remove_unfinished(tmp_path)
+    lock.remove_unfinished(tmp_path)
     assert files(tmp_path) == sorted(kept)
 
 
@@ -494,10 +496,10 @@ def test_a_complete_cell_is_freed_from_who_was_killed_with_it(tmp_path):
     """Killed between the last file of a cell and the end of its lock; a lock of the living stays."""
     folder = write_cell(Results(tmp_path)).folder
     whole = files(folder)
-    (folder / "lock").write_bytes(r._signed({**r._identity(), "started": 1.0}))
+    (folder / "lock").write_bytes(lock._signed({**lock._identity(), "started": 1.0}))
     (folder / ".cell.host-1.tmp").mkdir()
-    r.tidy(folder)
+    lock.tidy(folder)
     assert files(folder) == whole and not (folder / ".cell.host-1.tmp").exists()
-    with r.locked(folder):
-        r.tidy(folder)
+    with lock.locked(folder):
+        lock.tidy(folder)
         assert files(folder) == sorted([*whole, "lock"])

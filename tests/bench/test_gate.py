@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from typer.testing import CliRunner
 
-from olpm_bench.bench import config, gate, metrics, run, statistics
+from olpm_bench.bench import experiment_file, gate, metrics, run, statistics
 from olpm_bench.bench.config import ConfigError, Experiment
 from olpm_bench.bench.results import Reference, Results, write_reference
 from olpm_bench.cli import app
@@ -41,7 +41,7 @@ def call(*arguments: object):
 
 def load(tmp_path: Path, claims: str, text: str = TOML) -> Experiment:
     (tmp_path / "claims.toml").write_text(text + claims)
-    return config.load(tmp_path / "claims.toml")
+    return experiment_file.load(tmp_path / "claims.toml")
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_what_cannot_be_measured_does_not_hold(known, monkeypatch):
 def test_claims_come_back_from_the_results_folder(known):
     experiment = known(f'{CLAIM}metric = "l1"\nratio = 0.8')
     (experiment.path.parent / "again.toml").write_text(experiment.toml())
-    assert config.load(experiment.path.parent / "again.toml").claim == experiment.claim
+    assert experiment_file.load(experiment.path.parent / "again.toml").claim == experiment.claim
 
 
 # ---------------------------------------------------------------- how sure

@@ -11,7 +11,7 @@ from small_scenes import box, camera, grey, wall
 from test_cli import call, complaint
 
 import olpm_bench
-from olpm_bench.bench import config, inspect
+from olpm_bench.bench import config, experiment_file, inspect
 from olpm_bench.bench.results import Results
 from olpm_bench.scenes.load import load
 
@@ -50,7 +50,7 @@ def experiment(tmp_path) -> Path:
 
 def test_a_results_folder_gives_the_passes_of_its_cells(experiment, tmp_path):
     """A cosine is learnt and sampled on a diffuse block: as good as the BSDF, which is the same."""
-    results, loaded = Results(tmp_path / "results" / "test"), config.load(experiment)
+    results, loaded = Results(tmp_path / "results" / "test"), experiment_file.load(experiment)
     results.write_text("experiment.toml", loaded.toml(results.folder))
     spec, grey_image = loaded.cells()[1], np.full((12, 16, 3), 0.5, np.float32)
     results.write_cell("cornell_box", "Cosine", 3, {"key": spec.key, "training_passes": 2}, [{"seconds": 1.0}],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from olpm_bench.bench import config, metrics, run
+from olpm_bench.bench import experiment_file, metrics, run
 from olpm_bench.bench.results import Reference, Results, write_reference
 from olpm_bench.cli import app
 
@@ -34,7 +34,7 @@ integrator = { roulette = "throughput" }
 def folder(tmp_path, monkeypatch) -> Path:
     """The results of an older version: known images, brighter than the reference by 0.1 (seed 0) and 0.2."""
     (tmp_path / "known.toml").write_text(TOML)
-    experiment = config.load(tmp_path / "known.toml")
+    experiment = experiment_file.load(tmp_path / "known.toml")
     truth = np.full((8, 12, 3), 0.5, np.float32)
     write_reference(tmp_path / "results" / "references" / experiment.reference_key(experiment.scene[0]),
                     Reference(truth, truth.copy(), truth, truth, {"spp_a": 1, "spp_b": 1}))

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from olpm_bench.bench import cell, config, reference
-from olpm_bench.bench.results import LockedError, ResultError, locked, read_reference
+from olpm_bench.bench import cell, experiment_file, reference
+from olpm_bench.bench.lock import LockedError, locked
+from olpm_bench.bench.results import ResultError, read_reference
 
 TOML = """
 title = "Test"
@@ -37,7 +38,7 @@ def experiment(tmp_path, monkeypatch):
     monkeypatch.setattr(reference, "Clock", Ticks)
     monkeypatch.setattr(reference, "_spp_of_pass", lambda *_: 4)
     (tmp_path / "test.toml").write_text(TOML)
-    return config.load(tmp_path / "test.toml")
+    return experiment_file.load(tmp_path / "test.toml")
 
 
 def read(folder: Path):
@@ -113,4 +114,4 @@ def test_two_processes_do_not_improve_one_reference(experiment, tmp_path):
 def test_a_scene_with_a_reference_of_its_own_is_left_out(experiment, tmp_path):
     (tmp_path / "given.exr").write_bytes(b"")
     experiment.path.write_text(TOML.replace("max_depth = 3", 'max_depth = 3\nreference = "given.exr"'))
-    assert reference.improve(config.load(experiment.path), tmp_path, seconds=1) == {}
+    assert reference.improve(experiment_file.load(experiment.path), tmp_path, seconds=1) == {}

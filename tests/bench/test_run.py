@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 from small_experiment import TOML
 
-from olpm_bench.bench import config, run
+from olpm_bench.bench import experiment_file, run
 from olpm_bench.bench.cell import CellFailedError
 from olpm_bench.bench.config import Experiment
-from olpm_bench.bench.results import Reference, ResultError, Results, locked, write_reference
+from olpm_bench.bench.lock import locked
+from olpm_bench.bench.results import Reference, ResultError, Results, write_reference
 
 
 @pytest.fixture
 def experiment(tmp_path) -> Experiment:
     """An experiment with a (made up) reference in place."""
     (tmp_path / "test.toml").write_text(TOML)
-    loaded = config.load(tmp_path / "test.toml")
+    loaded = experiment_file.load(tmp_path / "test.toml")
     grey = np.full((12, 16, 3), 0.5, np.float32)
     reference = Reference(grey, grey + 0.01, grey, grey, {"spp_a": 1, "spp_b": 1})
     write_reference(tmp_path / "results" / "references" / loaded.reference_key(loaded.scene[0]), reference)
@@ -55,7 +56,7 @@ def test_a_rerun_skips_what_is_complete(experiment, root, monkeypatch):
     assert run.run(experiment, root) == []
     assert all(cells(experiment, root))
     assert json.loads((root / "test" / "env.json").read_text())["variant"] == "llvm_ad_rgb"
-    assert config.load(root / "test" / "experiment.toml").cells()[0].key == experiment.cells()[0].key
+    assert experiment_file.load(root / "test" / "experiment.toml").cells()[0].key == experiment.cells()[0].key
     monkeypatch.setattr(run, "measure", counted := Counted())
     assert run.run(experiment, root) == [] and counted.calls == 0
 
@@ -134,13 +135,13 @@ def test_a_plan_counts_what_is_left(experiment, root):
     run.run(experiment, root)
     assert run.plan(experiment, root)["todo"] == []
     experiment.path.write_text(TOML.replace("spp = 11", "seconds = 900"))
-    assert run.plan(config.load(experiment.path), root)["hours"] == 1.0
+    assert run.plan(experiment_file.load(experiment.path), root)["hours"] == 1.0
 
 
 def test_the_committed_references_are_found(experiment, tmp_path, root):
     """`<folder of the TOML>/../results/references` serves whatever `--results` is."""
     (tmp_path / "experiments").mkdir()
     experiment.path.rename(tmp_path / "experiments" / "test.toml")
-    moved = config.load(tmp_path / "experiments" / "test.toml")
+    moved = experiment_file.load(tmp_path / "experiments" / "test.toml")
     found = run.references(moved, tmp_path / "elsewhere")["cornell_box"]
     assert found.noise_floor == pytest.approx(0.005, rel=1e-4)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from olpm_bench.bench import config, run, scale
+from olpm_bench.bench import config, experiment_file, run, scale
 from olpm_bench.bench.config import ConfigError
 from olpm_bench.bench.results import Reference, ResultError, Results, write_reference
 
@@ -49,7 +49,7 @@ method = [{ name = "Jensen", training = { neighbours = 20 } }]
 
 def load(tmp_path: Path, scale: str | None, text: str = TOML + SMALL + ONE) -> config.Experiment:
     (tmp_path / "test.toml").write_text(text)
-    return config.load(tmp_path / "test.toml", scale=scale)
+    return experiment_file.load(tmp_path / "test.toml", scale=scale)
 
 
 def test_tables_are_merged_and_a_table_changes_all_scenes(tmp_path):
@@ -85,7 +85,7 @@ def test_a_scale_has_results_and_commands_of_its_own(tmp_path):
         run.run(small, tmp_path / "results")
     assert not (tmp_path / "results").exists()
     (tmp_path / "resolved.toml").write_text(small.toml())
-    assert [c.key for c in config.load(tmp_path / "resolved.toml").cells()] == [c.key for c in small.cells()]
+    assert [c.key for c in experiment_file.load(tmp_path / "resolved.toml").cells()] == [c.key for c in small.cells()]
 
 
 @pytest.mark.parametrize("scale, text, words", [

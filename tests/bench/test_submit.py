@@ -14,7 +14,7 @@ import psutil
 import pytest
 from typer.testing import CliRunner
 
-from olpm_bench.bench import config
+from olpm_bench.bench import experiment_file
 from olpm_bench.bench.config import ConfigError
 from olpm_bench.bench.results import Results
 from olpm_bench.bench.shard import Shard
@@ -56,7 +56,7 @@ def call(*arguments: object):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 def test_shards_do_every_cell_once_and_keep_methods_together(experiment, count):
-    cells = config.load(experiment).cells()
+    cells = experiment_file.load(experiment).cells()
     parts = [Shard(i, count).of(cells) for i in range(1, count + 1)]
     assert sorted(str(spec) for part in parts for spec in part) == sorted(map(str, cells))
     assert max(map(len, parts)) - min(map(len, parts)) <= 2         # methods
@@ -110,7 +110,7 @@ def test_a_worker_is_killed_and_no_cell_is_lost_or_done_twice(experiment, tmp_pa
         running.wait(30)
     assert running.returncode == 0, errors
     assert "Roulette" in out and (results / "shared" / "summary.json").exists()
-    cells = config.load(experiment).cells()
+    cells = experiment_file.load(experiment).cells()
     assert all(Results(results / "shared").verified_cell(c.scene.name, c.method.name, c.seed) for c in cells)
     assert not [f for f in results.rglob("*") if f.name == "lock" or ".tmp" in f.name]
     logs = "".join(log.read_text() for log in (results / "shared" / "jobs").glob("*_log.err"))
@@ -140,7 +140,7 @@ def test_a_failure_of_another_worker_is_not_repeated(experiment, tmp_path, monke
     from olpm_bench.bench import run
 
     experiment.write_text(TOML.replace("spp = 2000", "spp = 2").replace("seeds = 4", "seeds = 1"))
-    loaded, calls = config.load(experiment), []
+    loaded, calls = experiment_file.load(experiment), []
     results = Results(tmp_path / "results" / "shared")
 
     def fail(spec, *args, **kwargs):
@@ -158,10 +158,10 @@ def test_a_failure_of_another_worker_is_not_repeated(experiment, tmp_path, monke
 
 def test_what_is_in_other_hands_is_waited_for(experiment, tmp_path, monkeypatch):
     from olpm_bench.bench import run
-    from olpm_bench.bench.results import locked
+    from olpm_bench.bench.lock import locked
 
     experiment.write_text(TOML.replace("spp = 2000", "spp = 2").replace("seeds = 4", "seeds = 1"))
-    loaded, waited = config.load(experiment), []
+    loaded, waited = experiment_file.load(experiment), []
     other = locked(Results(tmp_path / "results" / "shared").cell_folder("cornell_box", "Path tracing", 0))
     other.__enter__()
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from olpm_bench.bench import config, metrics, statistics, summary
+from olpm_bench.bench import config, experiment_file, metrics, statistics, summary
 from olpm_bench.bench.results import Reference, ResultError, Results
 from olpm_bench.transport.settings import IntegratorSettings
 
@@ -22,7 +22,7 @@ TIMES = [1.0, 4.0, 16.0]
 
 
 def folder(tmp_path, errors: dict[str, list[float]], seeds: list[int]) -> SimpleNamespace:
-    experiment = config.parse({
+    experiment = experiment_file.parse({
         "title": "Known errors", "seeds": seeds, "budget": {"seconds": 16},
         "scene": [{"name": "door_ajar", "width": 6, "height": 5}],
         "method": [{"name": name} for name in errors]}, "known.toml", tmp_path)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from olpm_bench.bench import config, sweep
+from olpm_bench.bench import config, experiment_file, sweep
 from olpm_bench.bench.config import ConfigError
 
 TOML = """
@@ -37,7 +37,7 @@ y = ["l1", "bytes"]
 
 def load(tmp_path: Path, text: str = TOML) -> config.Experiment:
     (tmp_path / "test.toml").write_text(text)
-    return config.load(tmp_path / "test.toml")
+    return experiment_file.load(tmp_path / "test.toml")
 
 
 def test_a_sweep_is_a_method_for_each_value(tmp_path):

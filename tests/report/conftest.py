@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from olpm_bench.bench import config
+from olpm_bench.bench import experiment_file
 from olpm_bench.bench.results import Reference, Results
 
 NOISE = {"Path tracing": 0.5, "Quick & dirty": 0.2}         # standard deviation of a pixel after 1 s
@@ -17,7 +17,7 @@ SIZE = (18, 32)
 @pytest.fixture()
 def finished(tmp_path) -> SimpleNamespace:
     """experiment, results, references: one scene, two methods, three seeds, 16 seconds."""
-    experiment = config.parse({
+    experiment = experiment_file.parse({
         "title": "Synthetic", "seeds": 3, "budget": {"seconds": 16, "checkpoints": 5},
         "scene": [{"name": "door_ajar", "width": SIZE[1], "height": SIZE[0]}],
         "method": [{"name": name} for name in NOISE]}, "synthetic.toml", tmp_path)

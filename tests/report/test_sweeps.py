@@ -10,7 +10,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from skimage.io import imread
 
-from olpm_bench.bench import config
+from olpm_bench.bench import experiment_file
 from olpm_bench.bench.results import Reference, ResultError, Results
 from olpm_bench.report import figures, sweeps
 
@@ -22,7 +22,7 @@ def made(tmp_path, reference: str | None = None, **sweep) -> SimpleNamespace:
     """Cells with errors of ERRORS times 0.9, 1, 1.2 for three seeds; 1000 photons a pass, all stored or one pass at a time."""
     scene = {"name": "door_ajar", "width": 8, "height": 6} | ({"reference": reference} if reference else {})
     series = {"representation": {"type": "jensen"}, "sweep": {"training.passes": [1, 4, 16]}}
-    experiment = config.parse({
+    experiment = experiment_file.parse({
         "title": "Synthetic", "seeds": 3, "budget": {"spp": 16}, "scene": [scene], "sweep": sweep, "method": [
             {"name": "Path tracing"}, {"name": "Stored", **series, "training": {"schedule": "single_batch"}},
             {"name": "On-line", **series}]}, "synthetic.toml", tmp_path)

@@ -138,7 +138,7 @@ def test_guides_are_saved_and_loaded(scene, tmp_path):
     a, b = (mi.render(scene, integrator=olpm_bench.integrator(g, max_depth=DEPTH), spp=8, seed=1).numpy() for g in (guide, again))
     np.testing.assert_array_equal(a, b)
     (tmp_path / "broken.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"broken.npz: not a whole guide file"):
+    with pytest.raises(ValueError, match=r"broken.npz: not a whole .npz file"):
         Guide.load(tmp_path / "broken.npz")
 
 

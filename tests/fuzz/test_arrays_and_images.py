@@ -1,0 +1,174 @@
+"""Guides, directions and images that are broken in any way: a whole one, or one line that says that it is not."""
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from child import child
+from hypothesis import given
+from hypothesis import strategies as st
+from mutations import NUMBERS, examples, mutated_bytes, tables
+
+from olpm_bench.bench.results import write_exr
+from olpm_bench.transport.cache import SPLIT, RecordCache
+from olpm_bench.transport.guide import Guide
+from representations.interface import ParticleBatch
+
+
+@pytest.fixture(scope="module")
+def process():
+    with child() as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory) -> dict[str, bytes]:
+    """A small guide with split cells, directions, and an image."""
+    folder = tmp_path_factory.mktemp("valid")
+    guide = Guide(RecordCache(mi.ScalarBoundingBox3f(-1, 1), 0.2), {"type": "jensen", "resolution": 2}, 0.5)
+    rng = np.random.default_rng(0)
+    p = rng.uniform(-1, 1, (3, 200)).astype(np.float32)
+    guide.grow(mi.Point3f(p), dr.normalize(mi.Normal3f(rng.normal(size=(3, 200)).astype(np.float32))), mi.Bool(True), 0)
+    n = guide.records
+    batch = ParticleBatch.from_arrays(mi.Vector3f(0, 0.6, 0.8), dr.ones(mi.Float, n), dr.arange(mi.UInt32, n), n)
+    guide.learn_particles(batch, 0)
+    guide.save(folder / "guide.npz")
+    wo = rng.normal(size=(20, 3)) * (1, 1, 0) + (0, 0, 3)
+    np.savez(folder / "directions.npz", wo=wo / np.linalg.norm(wo, axis=1, keepdims=True), weight=np.ones(20), pdf=np.ones(20))
+    write_exr(folder / "image.exr", {"mean": rng.uniform(size=(6, 8, 3)).astype(np.float32), "count": np.ones((6, 8))}, {"a": 1})
+    return {file.stem: file.read_bytes() for file in folder.iterdir()}
+
+
+def judge(process, folder: Path, kind: str, content: bytes) -> str:
+    """The file read by the child; returns whether it was whole."""
+    file = folder / f"broken.{'exr' if kind == 'image' else 'npz'}"
+    file.write_bytes(content)
+    answer = process.ask(kind, str(file))
+    assert {"ok", "refused"} & answer.keys(), answer
+    if "refused" in answer:
+        assert str(file) in answer["refused"], answer
+    return next(iter(answer))
+
+
+def arrays_of(content: bytes) -> dict[str, np.ndarray]:
+    with np.load(io.BytesIO(content)) as file:
+        return dict(file)
+
+
+def packed(arrays: dict[str, np.ndarray]) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+@st.composite
+def changed_arrays(draw: st.DrawFn, valid: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays one or two of which are missing, of other types, sizes or values."""
+    arrays = dict(valid)
+    for _ in range(draw(st.integers(1, 2))):
+        name = draw(st.sampled_from(sorted(arrays)))
+        array = arrays[name]
+        how = draw(st.sampled_from(["delete", "type", "cut", "grow", "empty", "value", "value", "value", "reshape", "swap"]))
+        if how == "delete":
+            del arrays[name]
+        elif how == "type":
+            arrays[name] = array.astype(draw(st.sampled_from(["f8", "i8", "u1", "f2", "U8", "c16", ">f4"]))) \
+                if array.dtype.kind != "U" else np.zeros(3)
+        elif how == "cut":
+            arrays[name] = array[:len(array) // 2] if array.ndim else np.array([array, array])
+        elif how == "grow":
+            arrays[name] = np.concatenate([array, array]) if array.ndim else np.array(2 ** 40)
+        elif how == "empty":
+            arrays[name] = np.zeros(0, array.dtype)
+        elif how == "reshape":
+            arrays[name] = array.reshape(1, *array.shape)
+        elif how == "swap":
+            arrays[name] = arrays[draw(st.sampled_from(sorted(arrays)))]
+        elif name == "meta" and array is valid["meta"]:
+            arrays[name] = np.array(json.dumps(draw(tables(json.loads(str(array))))))
+        elif array.size:
+            array = array.copy()
+            with np.errstate(all="ignore"):
+                array.flat[draw(st.integers(0, array.size - 1))] = np.array(draw(st.sampled_from(
+                    [x for x in NUMBERS if array.dtype.kind == "f" or 0 <= x < 2**31]))).astype(array.dtype)
+            arrays[name] = array
+    return arrays
+
+
+@examples(0.2)
+@given(data=st.data())
+def test_guides_whose_arrays_are_broken(process, valid, tmp_path_factory, data):
+    arrays = data.draw(changed_arrays(arrays_of(valid["guide"])))
+    judge(process, tmp_path_factory.getbasetemp(), "guide", packed(arrays))
+
+
+@examples(0.1)
+@given(data=st.data(), kind=st.sampled_from(["guide", "directions"]))
+def test_archives_whose_bytes_are_broken(process, valid, tmp_path_factory, data, kind):
+    judge(process, tmp_path_factory.getbasetemp(), kind, data.draw(mutated_bytes(valid[kind], dictionary=(b"PK\x03\x04",))))
+
+
+@examples(0.05)
+@given(data=st.data())
+def test_directions_whose_arrays_are_broken(process, valid, tmp_path_factory, data):
+    arrays = data.draw(changed_arrays(arrays_of(valid["directions"])))
+    judge(process, tmp_path_factory.getbasetemp(), "directions", packed(arrays))
+
+
+@examples(0.1)
+@given(data=st.data())
+def test_images_whose_bytes_are_broken(process, valid, tmp_path_factory, data):
+    judge(process, tmp_path_factory.getbasetemp(), "image", data.draw(mutated_bytes(valid["image"])))
+
+
+def test_what_is_whole_is_read(process, valid, tmp_path):
+    for kind, content in valid.items():
+        assert judge(process, tmp_path, kind, content) == "ok"
+    assert judge(process, tmp_path, "guide", packed(arrays_of(valid["guide"]))) == "ok"
+
+
+def table(arrays: dict[str, np.ndarray], entry: int) -> dict[str, np.ndarray]:
+    entries = arrays["cache.table_entries"].copy()
+    entries[0] = entry
+    return {"cache.table_entries": entries}
+
+
+@pytest.mark.parametrize("change", [
+    pytest.param(lambda a: table(a, 10**6), id="an entry for a record that is not there"),
+    pytest.param(lambda a: table(a, SPLIT + 10**6), id="a cell split into a block that is not there"),
+    pytest.param(lambda a: a | {"cache.table_used": a["cache.table_used"] + np.uint32(2**31)}, id="a place beyond the table"),
+    pytest.param(lambda a: {"cache.table_size": np.array(10**15)}, id="a table larger than any memory"),
+    pytest.param(lambda a: {"cache.cells_record": a["cache.cells_record"] + np.uint32(9999)}, id="a cell of no record"),
+    pytest.param(lambda a: {"cache.bbox": np.full((2, 3), np.nan, np.float32)}, id="a box that is none"),
+    pytest.param(lambda a: {"cache.bbox": np.float32([[-3e38] * 3, [3e38] * 3])}, id="a box whose size float32 cannot hold"),
+    pytest.param(lambda a: {"cache.bbox": np.float32([[0] * 3, [1e-44] * 3])}, id="a box that is too small"),
+    pytest.param(lambda a: {"cache.record_radius": np.array(0.0)}, id="records without extent"),
+    pytest.param(lambda a: {"state.mass": a["state.mass"][:8]}, id="a state of fewer records"),
+    pytest.param(lambda a: {"state.mass": a["state.mass"].astype(np.float64)}, id="a state of another type"),
+    pytest.param(lambda a: {"pixels": np.zeros((0, 0), np.float32)}, id="an image without pixels"),
+    pytest.param(lambda a: {"meta": np.array("[" * 10**5)}, id="JSON too deep"),
+    pytest.param(lambda a: {"meta": np.array('{"format": 5, "representation": 3}')}, id="a representation that is no table"),
+    pytest.param(lambda a: {"meta": np.array(str(a["meta"]).replace("resolution", "resolutions"))}, id="a parameter it has not"),
+])
+def test_guides_that_would_be_read_out_of_bounds(process, valid, tmp_path, change):
+    arrays = arrays_of(valid["guide"])
+    assert judge(process, tmp_path, "guide", packed(arrays | change(arrays))) == "refused"
+
+
+def test_archives_that_are_larger_than_any_memory_or_locked(process, tmp_path):
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999999,), }"
+    header = b"\x93NUMPY\x01\x00" + (len(header) + 1).to_bytes(2, "little") + header + b"\n"
+    for kind in ("guide", "directions"):
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w") as archive:
+            archive.writestr("wo.npy", header)
+        assert judge(process, tmp_path, kind, stream.getvalue()) == "refused"
+        locked = stream.getvalue().replace(b"PK\x01\x02\x14\x03\x14\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01")
+        assert judge(process, tmp_path, kind, locked) == "refused"
+        assert judge(process, tmp_path, kind, header) == "refused"

@@ -1,0 +1,129 @@
+"""Files are data: reading one runs no code but that of FILE.py:Class, which is announced.  Python's own audit events tell."""
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+from typer.testing import CliRunner
+
+from olpm_bench.cli import app
+from olpm_bench.scenes import SceneError
+from olpm_bench.scenes.load import load
+from olpm_bench.transport.guide import FORMAT
+
+ROOT = Path(__file__).resolve().parents[2]
+WATCH = """
+import collections, dataclasses, json, os, sys
+folder, *files = sys.argv[1:]
+from olpm_bench.bench import environment, experiment_file, results
+environment.select_variant()
+from olpm_bench.scenes import load as scene_load
+from olpm_bench.transport.guide import Guide
+seen, makers = [], (collections.__file__, dataclasses.__file__)     # of the methods of classes
+def hook(event, arguments):
+    if event == "exec":
+        name = getattr(arguments[0], "co_filename", "?")
+        if sys._getframe(1).f_code.co_filename in makers:
+            return
+        if name.startswith(folder) or not (os.path.isabs(name) or name.startswith("<frozen")):
+            seen.append([event, name])
+    elif event in ("os.system", "subprocess.Popen", "os.exec", "os.fork", "os.posix_spawn", "socket.connect", "pickle.find_class",
+                   "shutil.rmtree", "os.remove", "os.rename", "os.mkdir"):
+        seen.append([event, str(arguments)])
+    elif event == "open" and (isinstance(arguments[1], str) and set(arguments[1]) & set("wax+")):
+        seen.append([event, str(arguments)])
+sys.addaudithook(hook)
+for file in files:
+    read = {".toml": experiment_file.load, ".npz": Guide.load, ".xml": scene_load.load, ".exr": results.read_exr}
+    try:
+        read[os.path.splitext(file)[1]](results.Path(file))
+    except ValueError as error:
+        print(error, file=sys.stderr)
+print(json.dumps(seen))
+"""
+EVIL = "__import__('os').system('touch {ran}')"
+
+
+def watched(folder: Path, *files: Path) -> tuple[list[list[str]], str]:
+    """What reading files has done, and what it has said."""
+    command = [sys.executable, "-c", WATCH, str(folder), *map(str, files)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT,
+                          env={**os.environ, "PYTHONPATH": str(ROOT)})
+    return json.loads(done.stdout.splitlines()[-1]), done.stderr
+
+
+def experiment(folder: Path, kind: str, text: str = "") -> Path:
+    data = {"title": f"T {text}", "description": text, "budget": {"spp": 1},
+            "scene": [{"name": "cornell_box", "width": 4, "height": 4, "reference": "none"}],
+            "method": [{"name": f"M {text}"}, {"name": "N", "representation": {"type": kind}}]}
+    file = folder / f"{kind.partition('.')[0]}.toml"
+    file.write_text(tomli_w.dumps(data))
+    return file
+
+
+def test_reading_runs_nothing_but_what_is_announced(tmp_path):
+    evil = EVIL.format(ran=tmp_path / "RAN")
+    (tmp_path / "mine.py").write_text("class Mine:\n    pass\n")
+    (tmp_path / "theirs.py").write_text(evil)
+    meta = {"format": FORMAT, "representation": {"type": f"{tmp_path}/theirs.py:Theirs"}, "fraction": 0.5, "parallax": False,
+            "particles": 1}
+    np.savez(tmp_path / "guide.npz", meta=np.array(json.dumps(meta)))
+    np.savez(tmp_path / "object.npz", meta=np.array([print], object))
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0"><bsdf type="{evil}"/><sensor type="perspective"/></scene>')
+    files = [experiment(tmp_path, "jensen", evil), experiment(tmp_path, evil), tmp_path / "guide.npz", tmp_path / "object.npz",
+             tmp_path / "scene.xml"]
+    seen, said = watched(tmp_path, *files)
+    assert seen == [] and "runs the code" not in said and not (tmp_path / "RAN").exists()
+    assert "whose code is run only if Guide.load is told this type" in said
+
+    seen, said = watched(tmp_path, *[experiment(tmp_path, "mine.py:Mine")] * 2)
+    assert {tuple(event) for event in seen} == {("exec", str(tmp_path / "mine.py"))}
+    assert said.count(f"olpm-bench: runs the code of {tmp_path / 'mine.py'}") == 1
+
+
+@pytest.mark.skipif(shutil.which("cc") is None or not sys.platform.startswith("linux"), reason="needs a C compiler, and Linux")
+def test_a_library_beside_a_scene_is_not_loaded_as_a_plugin(tmp_path, monkeypatch):
+    """Mitsuba looks for plugins in the scene's folder and in the current one before its own."""
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "evil.c").write_text('#include <stdio.h>\n__attribute__((constructor)) static void run(void) '
+                                     f'{{ fclose(fopen("{tmp_path / "RAN"}", "w")); }}')
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", tmp_path / "plugins" / "evil.so", tmp_path / "evil.c"], check=True)
+    for kind in ("evil", "../plugins/evil", f"../../../../../..{tmp_path}/plugins/evil"):
+        (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/>'
+                                            f'<shape type="{kind}"/></scene>')
+        with pytest.raises(SceneError, match=r"Mitsuba would run the code of .*evil\.so as a plugin"):
+            load(tmp_path / "scene.xml")
+    other = tmp_path / "other"
+    other.mkdir()
+    (tmp_path / "scene.xml").rename(other / "scene.xml")
+    with pytest.raises(SceneError, match="is the name of no plugin"):
+        load(other / "scene.xml")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneError, match=r"evil\.so as a plugin"):
+        load("cornell_box")
+    assert not (tmp_path / "RAN").exists()
+
+
+def test_results_stay_in_their_folder_and_links_in_it_are_replaced(tmp_path, monkeypatch):
+    """The file's name is that of the folder, and so must be one."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("..toml", "...toml", "references.toml"):
+        experiment(tmp_path, "jensen").rename(tmp_path / name)
+        result = CliRunner().invoke(app, ["run", name, "--results", "results"])
+        assert result.exit_code == 2 and "its results would go to the folder" in result.stderr
+        assert not (tmp_path / "results").exists()
+    file, outside = experiment(tmp_path, "jensen"), tmp_path / "precious.json"
+    outside.write_text("precious")
+    (tmp_path / "results" / "jensen").mkdir(parents=True)
+    for name in ("env.json", "experiment.toml"):
+        (tmp_path / "results" / "jensen" / name).symlink_to(outside)
+    result = CliRunner().invoke(app, ["run", str(file), "--results", "results", "--only-scene", "cornell_box", "--shard", "9/9"])
+    assert result.exit_code == 0, result.stderr
+    assert outside.read_text() == "precious" and not (tmp_path / "results" / "jensen" / "env.json").is_symlink()
