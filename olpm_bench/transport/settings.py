@@ -113,7 +113,7 @@ class TrainingSettings:
     emission: Literal["guided", "emitter"] = "guided"
     emission_fraction: float = 0.2
     weight_window: Literal["flux", "contribution"] = "contribution"
-    parallax: bool = False
+    parallax: bool = True
 
     def __post_init__(self) -> None:
         _require_types(self, "share")
@@ -139,7 +139,7 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
 
 # The talk's particles, gather and schedule [T, L]: photons and importons only, a fixed fraction.
 _PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "photons": 300_000, "importons": 300_000,
-          "camera_passes": 0, "learn_fraction": False, "weight_window": "flux", "fraction": 0.5}
+          "camera_passes": 0, "learn_fraction": False, "weight_window": "flux", "fraction": 0.5, "parallax": False}
 
 # What each preset changes of the defaults, which are those of `best`.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
