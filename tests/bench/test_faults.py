@@ -13,13 +13,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small_experiment import TOML
 from typer.testing import CliRunner
 
-from olpm_bench.bench import config, lock, submit
+from olpm_bench.bench import experiment_file, lock, submit
 from olpm_bench.bench import results as r
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.lock import LockedError
@@ -232,9 +233,9 @@ def test_no_step_of_the_clock_is_charged(tmp_path, monkeypatch):
     elapsed = time.perf_counter() - start
     assert 0 <= clock.charged <= clock.total.wall <= elapsed
     start = time.perf_counter()
-    assert run.run(config.load(tmp_path / "test.toml"), tmp_path / "results") == []
+    assert run.run(experiment_file.load(tmp_path / "test.toml"), tmp_path / "results") == []
     elapsed = time.perf_counter() - start
-    for spec in config.load(tmp_path / "test.toml").cells():
+    for spec in experiment_file.load(tmp_path / "test.toml").cells():
         cell = Results(tmp_path / "results" / "test").verified_cell(spec.scene.name, spec.method.name, spec.seed)
         assert 0 < cell.info["charged_seconds"] <= cell.info["wall_seconds"] <= elapsed
 
@@ -302,7 +303,7 @@ def test_who_has_lost_a_cell_does_not_write_it(tmp_path, monkeypatch):
     from olpm_bench.bench import run
 
     (tmp_path / "test.toml").write_text(BARE)
-    loaded, measure = config.load(tmp_path / "test.toml"), run.measure
+    loaded, measure = experiment_file.load(tmp_path / "test.toml"), run.measure
     folder = Results(tmp_path / "results" / "test").cell_folder("cornell_box", "Roulette", 1)
 
     def hangs(spec, *arguments, **options):
@@ -339,7 +340,7 @@ class Job:
                          ids=["another has found all complete", "nobody shows a sign of life"])
 def test_workers_that_hang_are_stopped(tmp_path, monkeypatch, jobs, silent, capfd):
     (tmp_path / "test.toml").write_text(TOML)
-    loaded, slept = config.load(tmp_path / "test.toml"), []
+    loaded, slept = experiment_file.load(tmp_path / "test.toml"), []
     folder = Results(tmp_path / "test").cell_folder("cornell_box", "Roulette", 1)
     folder.mkdir(parents=True)
     now = time.monotonic()
@@ -361,8 +362,8 @@ def test_whom_a_worker_waits_for_is_shown(tmp_path, monkeypatch):
     other.__enter__()
     shown: list[str] = []
     monkeypatch.setattr(progress.Bar, "at", lambda bar, done, label: shown.append(label))
-    monkeypatch.setattr(run.time, "sleep", lambda seconds: other.__exit__(None, None, None))
-    assert run.run(config.load(tmp_path / "test.toml"), tmp_path / "results", together=True) == []
+    monkeypatch.setattr(run, "time", SimpleNamespace(sleep=lambda seconds: other.__exit__(None, None, None)))
+    assert run.run(experiment_file.load(tmp_path / "test.toml"), tmp_path / "results", together=True) == []
     (waiting,) = [label for label in shown if label.startswith("waiting for")]
     assert "Roulette / seed 0" in waiting and f"held by process {os.getpid()}" in waiting and "taken over" in waiting
 
@@ -376,7 +377,7 @@ def test_two_runs_at_once_share_the_cells(tmp_path):
                              env={**os.environ, "PYTHONPATH": str(ROOT)}) for _ in range(2)]
     errors = [process.communicate(timeout=500)[1] for process in both]
     done = re.findall(r"\[\d+/\d+\] (cornell_box / .* / seed \d): 11 spp", "".join(errors))
-    assert sorted(done) == sorted(str(spec) for spec in config.load(tmp_path / "test.toml").cells())
+    assert sorted(done) == sorted(str(spec) for spec in experiment_file.load(tmp_path / "test.toml").cells())
     for process, said in zip(both, errors, strict=True):
         assert process.returncode == 0 or (process.returncode == 1 and "is held by process" in said), said
         assert "Traceback" not in said

@@ -124,8 +124,8 @@ def test_bad_files(files: tuple[Path, Path], tmp_path: Path) -> None:
     cosine, text, single = representations.create("cosine"), tmp_path / "text.npz", tmp_path / "single.npy"
     text.write_text("not NumPy")
     np.save(single, WO)
-    for samples, message in ((tmp_path / "none.npz", "there is no such file"), (text, "not an .npz"), (single, "not an .npz"),
-                             (tmp_path, "there is no such file")):
+    for samples, message in ((tmp_path / "none.npz", "there is no such file"), (text, "not a whole .npz"),
+                             (single, "not a whole .npz"), (tmp_path, "there is no such file")):
         with pytest.raises(ValueError, match=message):
             fit(cosine, samples, files[1])
     with pytest.raises(ValueError, match="no array 'pdf'; it has wo, weight"):

@@ -23,7 +23,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from olpm_bench.bench import config
+from olpm_bench.bench import experiment_file
 from olpm_bench.bench.results import Results
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -94,7 +94,7 @@ class Run:
 def complete(experiment: Path, results: Path) -> dict[str, tuple[int, int]]:
     """The cells that are complete: which file is their cell.json, and of when."""
     folder, found = Results(results / experiment.stem), {}
-    for spec in config.load(experiment).cells():
+    for spec in experiment_file.load(experiment).cells():
         cell = folder.verified_cell(spec.scene.name, spec.method.name, spec.seed)
         if cell is not None and cell.info["key"] == spec.key:
             status = (cell.folder / "cell.json").stat()

@@ -9,7 +9,8 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from olpm_bench.bench import config, run
+from olpm_bench.bench import experiment_file, run
+from olpm_bench.bench.config import Experiment
 from olpm_bench.bench.results import Results
 
 TOML = """
@@ -56,16 +57,16 @@ SCENE = """<scene version="3.0.0">
 CHILD = """
 import sys, representations, drjit as dr
 from pathlib import Path
-from olpm_bench.bench import config, environment, run
+from olpm_bench.bench import experiment_file, environment, run
 environment.select_variant(int(sys.argv[3]))
-assert run.run(config.load(Path(sys.argv[1])), Path(sys.argv[2])) == []
+assert run.run(experiment_file.load(Path(sys.argv[1])), Path(sys.argv[2])) == []
 """
 
 
 def test_images_repeat_in_another_process_on_other_threads_and_resumed(tmp_path: Path):
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "test.toml").write_text(TOML)
-    experiment, root = config.load(tmp_path / "test.toml"), tmp_path / "results"
+    experiment, root = experiment_file.load(tmp_path / "test.toml"), tmp_path / "results"
     assert run.run(experiment, root) == []
     images = _images(experiment, root)
     for scene in ("cornell_box", "lamps"):
@@ -78,7 +79,7 @@ def test_images_repeat_in_another_process_on_other_threads_and_resumed(tmp_path:
         np.testing.assert_array_equal(before, after, err_msg=where)
 
 
-def _images(experiment: config.Experiment, root: Path) -> dict[str, np.ndarray]:
+def _images(experiment: Experiment, root: Path) -> dict[str, np.ndarray]:
     cells = [Results(root / "test").verified_cell(c.scene.name, c.method.name, c.seed) for c in experiment.cells()]
     assert all(cells)
     return {f"{cell.scene}, seed {cell.seed}": cell.image()["mean"] for cell in cells}

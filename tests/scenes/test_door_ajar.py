@@ -114,7 +114,7 @@ def centre_rays(rotation: float) -> mi.Ray3f:
     ({"gap": 0.95}, "width of the door"),
     ({"gap": float("nan")}, "gap = nan"),
     ({"gap": "wide"}, "must be a number"),
-    ({"rotation": float("inf")}, "rotation = inf: must be finite"),
+    ({"rotation": float("inf")}, "rotation = inf: must be a number"),
     ({"floor_roughness": 0}, "floor_roughness = 0.0: must be in"),
     ({"gab": 0.07}, "no parameter 'gab'; known: gap, rotation, floor_roughness"),
 ])

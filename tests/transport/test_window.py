@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from small_scenes import box, grey, lamp, wall
 
-from olpm_bench.report import figures, particles
+from olpm_bench.report import figures, landings
 from olpm_bench.scenes import door_ajar
 from olpm_bench.scenes.load import load
 from olpm_bench.transport import settings
@@ -96,5 +96,5 @@ def test_particles_cross_the_slit(tmp_path):
     for kind in ("photons", "importons"):
         assert np.all(shares["contribution"][kind][-1] > 1.2 * shares["flux"][kind][-1]), (kind, shares)
     with figures.style():
-        figures.save(particles.draw(seen, ("dark room", "corridor")), tmp_path, "particles")
+        figures.save(landings.draw(seen, ("dark room", "corridor")), tmp_path, "particles")
     assert (tmp_path / "particles.png").stat().st_size > 5_000
