@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -169,7 +170,7 @@ def test_what_is_in_other_hands_is_waited_for(experiment, tmp_path, monkeypatch)
         waited.append(seconds)
         if len(waited) == 2:
             other.__exit__(None, None, None)
-    monkeypatch.setattr(run.time, "sleep", sleep)
+    monkeypatch.setattr(run, "time", SimpleNamespace(sleep=sleep))     # not the one that subprocesses wait with
     assert run.run(loaded, tmp_path / "results", together=True) == []
     assert len(waited) == 2 and len(list((tmp_path / "results").rglob("cell.json"))) == 2
 
