@@ -399,7 +399,6 @@ def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CL
     from olpm_bench.check import examination, suite
 
     experiment_file.announce(representation)
-
     specification = {"type": representation, **settings(set_, ("representation",))["representation"]}
     checks, subject = suite.named(only), suite.Subject(specification, seed, declare)
     if repeat > 1:

@@ -147,7 +147,7 @@ def largest_pass(spec: CellSpec) -> int:
 
 
 def seconds_of_pass(spec: CellSpec) -> float:
-    """Charged seconds that a rendering pass may take; for a budget in samples, that it takes at least."""
+    """Charged seconds that a rendering pass may take.  The warm-up times one of a quarter of them at least."""
     return max(SHORTEST_PASS, (spec.budget.seconds or 0) / PASSES)
 
 
