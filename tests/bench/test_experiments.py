@@ -1,13 +1,16 @@
 """The experiments of this project: each can be loaded at each of its scales, and is what it says."""
 from __future__ import annotations
 
+import copy
 import dataclasses
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tomli_w
 
-from olpm_bench.bench import config, experiment_file, run
+from olpm_bench.bench import cell, config, experiment_file, run
 from olpm_bench.transport import settings
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments"
@@ -54,9 +57,11 @@ def test_a_small_scale_needs_no_reference_of_its_own(tmp_path, name):
 @pytest.mark.parametrize("scale", [None, "small"])
 def test_the_talks_method_and_its_modern_version_stand_side_by_side(tmp_path, name, scale):
     experiment = of_this_project(tmp_path, name, scale)
-    scene, (plain, paper, best) = experiment.scene[0], experiment.method
-    assert plain.representation is None and paper.representation == best.representation == {"type": "gaussian_mixture"}
-    for method, preset in ((paper, "paper2014"), (best, "best")):
+    scene, (plain, *guided) = experiment.scene[0], experiment.method
+    presets = ["paper2014", "paper2014_norr", "best"] if name == "door_ajar.toml" else ["paper2014", "best"]
+    assert plain.representation is None
+    for method, preset in zip(guided, presets, strict=True):
+        assert method.representation == {"type": "gaussian_mixture"}
         wanted, found = settings.training(preset), experiment.training_of(method)
         amounts = {key: getattr(found, key) for key in ("passes", "photons", "importons")}
         assert found == dataclasses.replace(wanted, **amounts) and method.name == f"GMM, {preset}"
@@ -100,10 +105,49 @@ def test_the_ablation_leaves_out_one_addition_at_a_time(tmp_path):
 
 
 def test_the_targets_compare_presets_with_plain_path_tracing(tmp_path):
-    experiment = of_this_project(tmp_path, "targets.toml")
-    scene, names = experiment.scene[0], [method.name for method in experiment.method]
-    assert experiment.baseline_name == "Path tracing" and experiment.method[0].representation is None
-    for name, method in zip(names[1:], experiment.method[1:], strict=True):
-        preset = name.removeprefix("GMM ")
-        assert experiment.training_of(method) == settings.training(preset)
-        assert experiment.integrator_of(scene, method) == settings.integrator(preset)
+    for file in ("door_ajar.toml", "presets.toml", "targets.toml"):
+        experiment = of_this_project(tmp_path, file)
+        assert experiment.budget.seconds == 60 and len(experiment.seeds) >= 6
+        assert experiment.baseline_name == "Path tracing" and experiment.method[0].representation is None
+        for method in experiment.method[1:]:
+            preset = method.name.removeprefix("GMM, ") if method.name != "GMM" else "best"
+            assert experiment.training_of(method) == settings.training(preset)
+            assert experiment.integrator_of(experiment.scene[0], method) == settings.integrator(preset)
+
+
+def with_preset(tmp_path: Path, name: str, preset: str, **tiny: object) -> config.Experiment:
+    """An experiment of ours whose methods all have a preset, and differ in nothing else from what they are."""
+    table = copy.deepcopy(FILES[name])
+    table["training"] = {**table.get("training", {}), "preset": preset}
+    for method in table["method"]:
+        method.get("training", {}).pop("preset", None)
+    for scene in (s for s in table["scene"] if "file" in s):
+        scene["file"] = str(tmp_path / "room.xml")
+        (tmp_path / "room.xml").write_text('<scene version="3.0.0"/>')
+    (tmp_path / name).write_text(tomli_w.dumps(table | tiny))
+    return experiment_file.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("preset", settings.PRESETS)
+@pytest.mark.parametrize("name", FILES)
+def test_every_preset_fits_every_experiment(tmp_path, name, preset):
+    experiment = with_preset(tmp_path, name, preset)
+    roulette = settings.integrator(preset).roulette
+    for spec in (c for c in experiment.cells() if c.training is not None):
+        assert spec.integrator.roulette == spec.method.integrator.get("roulette", roulette)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", settings.PRESETS)
+@pytest.mark.parametrize("name", [name for name, table in FILES.items() if not any("file" in scene for scene in table["scene"])])
+def test_every_preset_runs_in_every_experiment(tmp_path, name, preset):
+    """Its first guided method, with few particles and pixels."""
+    found = next(c for c in with_preset(tmp_path, name, preset).cells() if c.training is not None)
+    few = {"passes": 1, "photons": 500, "importons": min(found.training.importons, 500),
+           "camera_passes": min(found.training.camera_passes, 2), "camera_paths": 256}
+    spec = dataclasses.replace(found, training=dataclasses.replace(found.training, **few),
+                               scene=found.scene.model_copy(update={"width": 16, "height": 9}),
+                               budget=config.Budget(spp=2, checkpoints=1))
+    scene = cell.load_scene(spec)
+    done = cell.measure(spec, scene, cell.warm_up(spec, scene))
+    assert done.info["spp"] >= 2 and done.info["records"] > 0 and np.isfinite(done.image["mean"]).all()
