@@ -278,7 +278,7 @@ def compare(a: Annotated[Path, typer.Argument(metavar="A.exr", show_default=Fals
             as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False) -> None:
     """Compare two images with a reference, or with each other, by every metric."""
     from olpm_bench.bench import compare as comparing
-    from olpm_bench.bench.results import plain
+    from olpm_bench.bench.files import plain
 
     found = comparing.compare(a, b, reference)
     if as_json:
@@ -310,7 +310,7 @@ def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedd
         raise InputError("give either --save-guide or --load-guide")
     environment.select_variant(threads)
     from olpm_bench.bench import render_one
-    from olpm_bench.bench.results import plain
+    from olpm_bench.bench.files import plain
 
     spec = render_one.cell(scene, method, set_, seconds=seconds, spp=spp, width=width, height=height,
                            max_depth=max_depth, seed=seed, load_guide=load_guide)
@@ -371,8 +371,8 @@ def fit(representation: Annotated[str, typer.Option(metavar="NAME", show_default
     import representations
     from olpm_bench.bench import experiment_file
     from olpm_bench.bench import fit as fitting
+    from olpm_bench.bench.files import plain
     from olpm_bench.bench.render_one import settings
-    from olpm_bench.bench.results import plain
 
     experiment_file.announce(representation)
     created = representations.create(representation, **settings(set_, ("representation",))["representation"])
@@ -394,8 +394,8 @@ def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CL
 
     environment.select_variant()
     from olpm_bench.bench import experiment_file
+    from olpm_bench.bench.files import plain
     from olpm_bench.bench.render_one import settings
-    from olpm_bench.bench.results import plain
     from olpm_bench.check import examination, suite
 
     experiment_file.announce(representation)
@@ -420,7 +420,7 @@ def perf(scene: Annotated[str, typer.Option(metavar="NAME|FILE.xml", help="What 
 
     environment.select_variant()
     from olpm_bench.bench import perf as performance
-    from olpm_bench.bench.results import plain
+    from olpm_bench.bench.files import plain
 
     print(json.dumps(plain(performance.measure(scene, width, height, passes=passes)), allow_nan=False))
 

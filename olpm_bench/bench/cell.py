@@ -18,10 +18,10 @@ import mitsuba as mi
 import numpy as np
 
 from olpm_bench.bench import environment, probe
+from olpm_bench.bench.accumulator import Accumulator
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec
 from olpm_bench.bench.metrics import luminance
-from olpm_bench.bench.results import Accumulator
 from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.training import PassStatistics, Training

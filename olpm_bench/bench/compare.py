@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench import metrics
-from olpm_bench.bench.results import ResultError, read_exr, read_reference
+from olpm_bench.bench.exr import read_exr
+from olpm_bench.bench.files import ResultError
+from olpm_bench.bench.reference_file import read_reference
 from olpm_bench.bench.summary import number, print_whole
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 import representations
 from olpm_bench import scenes as embedded
 from olpm_bench import transport
+from olpm_bench.bench.files import SCHEMA_VERSION, slug
 from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
-from olpm_bench.bench.results import SCHEMA_VERSION, slug
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes
 
 MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see cell.pass_seed

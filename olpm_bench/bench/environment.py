@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from olpm_bench.bench.clock import cores
-from olpm_bench.bench.results import SCHEMA_VERSION
+from olpm_bench.bench.files import SCHEMA_VERSION
 from olpm_bench.transport.settings import InputError
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")

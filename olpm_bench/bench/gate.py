@@ -13,7 +13,9 @@ import numpy as np
 
 from olpm_bench.bench import metrics, statistics
 from olpm_bench.bench.config import Claim, ConfigError, Experiment
-from olpm_bench.bench.results import SCHEMA_VERSION, Cell, Reference, Results
+from olpm_bench.bench.files import SCHEMA_VERSION
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Cell, Results
 from olpm_bench.bench.summary import complete_cells, number, print_whole, work
 
 if TYPE_CHECKING:

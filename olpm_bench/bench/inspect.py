@@ -21,8 +21,9 @@ from olpm_bench.bench import cell as cells
 from olpm_bench.bench import environment, vertex
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec, ConfigError, Experiment
+from olpm_bench.bench.files import SCHEMA_VERSION, slug, write_json
 from olpm_bench.bench.progress import Bar
-from olpm_bench.bench.results import SCHEMA_VERSION, Results, slug, write_json
+from olpm_bench.bench.results import Results
 from olpm_bench.report import figures, landings, records
 from olpm_bench.report import inspect as picture
 from olpm_bench.transport.camera_paths import CameraPaths

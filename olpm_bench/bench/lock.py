@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from olpm_bench.bench.results import ResultError, clean_up, remove_path, writer
+from olpm_bench.bench.files import ResultError, clean_up, remove_path, writer
 
 LEASE = 1800.0          # [s] without a sign of life after which a lock counts as left behind
 SIGNING = 10.0          # [s] until a lock is signed, at most

@@ -14,11 +14,13 @@ import mitsuba as mi
 import numpy as np
 
 from olpm_bench.bench import cell, environment
+from olpm_bench.bench.accumulator import Accumulator
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec, Experiment
+from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.lock import locked
 from olpm_bench.bench.progress import Bar
-from olpm_bench.bench.results import Accumulator, Reference, ResultError, find_reference, read_reference, write_reference
+from olpm_bench.bench.reference_file import Reference, find_reference, read_reference, write_reference
 from olpm_bench.bench.run import reference_folders
 
 ESTIMATOR = "path, unguided"

@@ -12,8 +12,9 @@ from olpm_bench.bench import environment
 from olpm_bench.bench.cell import load_scene, measure, warm_up
 from olpm_bench.bench.config import CellSpec, ConfigError
 from olpm_bench.bench.experiment_file import parse
+from olpm_bench.bench.exr import write_exr
+from olpm_bench.bench.files import check_writable, replacing
 from olpm_bench.bench.progress import Bar
-from olpm_bench.bench.results import check_writable, replacing, write_exr
 from olpm_bench.bench.run import require_memory
 from olpm_bench.report import records, tonemap
 from olpm_bench.transport.guide import MIN_PARTICLES, Guide

@@ -14,9 +14,11 @@ from olpm_bench.bench import environment
 from olpm_bench.bench.cell import CellFailedError, WarmUp, load_scene, measure, spp_of_pass, warm_up
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.config import CellSpec, Experiment, Scene
+from olpm_bench.bench.files import NewerSchemaError, ResultError
 from olpm_bench.bench.lock import LockedError, locked, remove_unfinished, tidy
 from olpm_bench.bench.progress import Bar, is_interrupt, reason
-from olpm_bench.bench.results import Cell, NewerSchemaError, Reference, ResultError, Results, find_reference, read_reference
+from olpm_bench.bench.reference_file import Reference, find_reference, read_reference
+from olpm_bench.bench.results import Cell, Results
 from olpm_bench.bench.shard import WHOLE, Shard
 from olpm_bench.transport import headroom
 

@@ -15,7 +15,9 @@ import numpy as np
 
 from olpm_bench.bench import metrics, statistics
 from olpm_bench.bench.clock import WAITED
-from olpm_bench.bench.results import SCHEMA_VERSION, Cell, Reference, ResultError, Results, plain
+from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Cell, Results
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench import summary
-from olpm_bench.bench.results import Reference, Results, read_json, replacing
+from olpm_bench.bench.files import read_json, replacing
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Results
 from olpm_bench.report import figures, sheet, tonemap
 
 if TYPE_CHECKING:

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench import statistics, summary
-from olpm_bench.bench.results import Cell, Reference, Results, read_json, replacing
+from olpm_bench.bench.files import read_json, replacing
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Cell, Results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,9 @@ import numpy as np
 
 from olpm_bench.bench import metrics, statistics, summary
 from olpm_bench.bench.config import Experiment, Method
-from olpm_bench.bench.results import Cell, Reference, Results, read_json
+from olpm_bench.bench.files import read_json
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Cell, Results
 from olpm_bench.bench.sweep import short
 from olpm_bench.report import figures
 

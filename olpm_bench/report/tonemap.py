@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from olpm_bench.bench.results import replacing
+from olpm_bench.bench.files import replacing
 
 INVALID = (255, 0, 255)         # how NaN and infinite pixels are shown: never as a plausible colour
 

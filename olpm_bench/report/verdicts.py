@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench.results import replacing
+from olpm_bench.bench.files import replacing
 from olpm_bench.report import figures
 
 if TYPE_CHECKING:

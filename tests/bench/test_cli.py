@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from olpm_bench.bench.results import Reference, read_exr, write_reference
+from olpm_bench.bench.exr import read_exr
+from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from olpm_bench.bench import metrics
-from olpm_bench.bench.results import Reference, write_exr, write_reference
+from olpm_bench.bench.exr import write_exr
+from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.cli import app
 
 RNG = np.random.default_rng(11)
@@ -32,7 +33,7 @@ def call(*arguments: object):
 
 
 def image(path: Path) -> np.ndarray:
-    from olpm_bench.bench.results import read_exr
+    from olpm_bench.bench.exr import read_exr
     return read_exr(path)[0]["mean"]
 
 

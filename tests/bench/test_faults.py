@@ -20,11 +20,13 @@ import pytest
 from small_experiment import TOML
 from typer.testing import CliRunner
 
-from olpm_bench.bench import experiment_file, lock, submit
-from olpm_bench.bench import results as r
+from olpm_bench.bench import experiment_file, files, lock, submit
+from olpm_bench.bench.accumulator import Accumulator
 from olpm_bench.bench.clock import Clock
+from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.lock import LockedError
-from olpm_bench.bench.results import Reference, ResultError, Results
+from olpm_bench.bench.reference_file import Reference, read_reference, write_reference
+from olpm_bench.bench.results import Cell, Results
 from olpm_bench.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,14 +39,14 @@ def image(h=9, w=16, seed=0) -> np.ndarray:
     return np.random.default_rng(seed).random((h, w, 3), dtype=np.float32)
 
 
-def write_cell(results: Results, seed=0) -> r.Cell:
+def write_cell(results: Results, seed=0) -> Cell:
     layers = {"mean": image(seed=seed), "variance": np.full((9, 16, 3), np.inf), "count": np.full((9, 16), 8)}
     info = {"key": f"k{seed}", "charged_seconds": 15.25, "spp": 8}
     return results.write_cell(*NAMES, info, [{"seconds": 0.5, "spp": 4}, {"seconds": 1.5, "spp": 8}], layers,
                               [image(seed=seed), image(seed=seed)], {"title": "a test"})
 
 
-def files(folder: Path) -> list[str]:
+def files_in(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
@@ -89,12 +91,12 @@ def test_what_a_disk_has_changed_is_not_believed(tmp_path, name, capfd):
 @pytest.mark.parametrize("name", ["reference.exr", "meta.json"])
 def test_a_broken_reference_is_refused_and_its_remedy_named(tmp_path, name, capfd):
     halves = [image(seed=i) for i in range(4)]
-    r.write_reference(tmp_path / "k", Reference(*halves, {"spp_a": 3, "spp_b": 1, "passes_a": 3, "passes_b": 3, "seconds": 1.0}))
-    whole, content, refused = r.read_reference(tmp_path / "k", 16, 9), (tmp_path / "k" / name).read_bytes(), 0
+    write_reference(tmp_path / "k", Reference(*halves, {"spp_a": 3, "spp_b": 1, "passes_a": 3, "passes_b": 3, "seconds": 1.0}))
+    whole, content, refused = read_reference(tmp_path / "k", 16, 9), (tmp_path / "k" / name).read_bytes(), 0
     for changed in mutations(content, 60):
         (tmp_path / "k" / name).write_bytes(changed)
         try:
-            again = r.read_reference(tmp_path / "k", 16, 9)
+            again = read_reference(tmp_path / "k", 16, 9)
         except ResultError as error:
             assert "remove the folder and make it again" in str(error) or "is newer" in str(error)
             refused += 1
@@ -138,7 +140,7 @@ for disk in sys.argv[3:]:
         said = f"{error.filename}: {error.strerror}"
     cell = results.verified_cell(*NAMES)
     assert cell is None and complete is None or cell.info["key"] == complete, (disk, complete)
-    print(said, ",".join(files(folder)))
+    print(said, ",".join(files_in(folder)))
 """
 
 
@@ -191,7 +193,7 @@ def test_a_guide_or_image_that_cannot_be_written_is_named_before_the_rendering(t
         raise OSError(30, "Read-only file system", str(options["dir"] / "tmpx"))
 
     monkeypatch.setattr(render_one, "warm_up", lambda *_: pytest.fail("rendered"))
-    monkeypatch.setattr(r.tempfile, "TemporaryFile", read_only)
+    monkeypatch.setattr(files.tempfile, "TemporaryFile", read_only)
     done = CliRunner().invoke(app, ["render", "cornell_box", "--method", "unguided", "--spp", "1", "--out", f"{tmp_path}/x.exr"])
     assert done.exit_code == 2 and done.stderr == f"olpm-bench: {tmp_path}: Read-only file system\n"
 
@@ -314,7 +316,7 @@ def test_who_has_lost_a_cell_does_not_write_it(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "measure", hangs)
     (problem,) = run.run(loaded, tmp_path / "results")
     assert problem.startswith("cornell_box / Roulette / seed 1: ") and "was lost to another process" in problem
-    assert files(folder) == ["lock"]
+    assert files_in(folder) == ["lock"]
 
 
 class Job:
@@ -381,7 +383,7 @@ def test_two_runs_at_once_share_the_cells(tmp_path):
     for process, said in zip(both, errors, strict=True):
         assert process.returncode == 0 or (process.returncode == 1 and "is held by process" in said), said
         assert "Traceback" not in said
-    assert not [name for name in files(tmp_path) if ".tmp" in name or name.endswith("lock")]
+    assert not [name for name in files_in(tmp_path) if ".tmp" in name or name.endswith("lock")]
 
 
 # ---------------------------------------------------------------- interruptions
@@ -448,12 +450,12 @@ def test_an_interrupted_command_says_how_to_go_on(tmp_path, monkeypatch, number,
     done = CliRunner().invoke(app, run_it if command == "run" else ["check", "cosine"])
     assert done.exit_code == 130 and done.stderr.splitlines()[-1] == f"olpm-bench: interrupted; {hint}"
     assert signal.signal(number, found) is before
-    assert not [name for name in files(tmp_path) if ".tmp" in name or name.endswith("lock")]
+    assert not [name for name in files_in(tmp_path) if ".tmp" in name or name.endswith("lock")]
 
 
 def test_a_torn_pass_never_enters_a_reference(monkeypatch):
     """Ctrl-C between any two steps of adding a pass: the counts and the mean are of the same passes."""
-    accumulator = r.Accumulator.empty(2, 3)
+    accumulator = Accumulator.empty(2, 3)
     accumulator.add(np.ones((2, 3, 3)), 4)
 
     class Interrupting(np.ndarray):
@@ -490,17 +492,17 @@ def test_unfinished_files_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
     for name in left + kept:
         (tmp_path / name).touch()
     lock.remove_unfinished(tmp_path)
-    assert files(tmp_path) == sorted(kept)
+    assert files_in(tmp_path) == sorted(kept)
 
 
 def test_a_complete_cell_is_freed_from_who_was_killed_with_it(tmp_path):
     """Killed between the last file of a cell and the end of its lock; a lock of the living stays."""
     folder = write_cell(Results(tmp_path)).folder
-    whole = files(folder)
+    whole = files_in(folder)
     (folder / "lock").write_bytes(lock._signed({**lock._identity(), "started": 1.0}))
     (folder / ".cell.host-1.tmp").mkdir()
     lock.tidy(folder)
-    assert files(folder) == whole and not (folder / ".cell.host-1.tmp").exists()
+    assert files_in(folder) == whole and not (folder / ".cell.host-1.tmp").exists()
     with lock.locked(folder):
         lock.tidy(folder)
-        assert files(folder) == sorted([*whole, "lock"])
+        assert files_in(folder) == sorted([*whole, "lock"])

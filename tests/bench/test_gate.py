@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from olpm_bench.bench import experiment_file, gate, metrics, run, statistics
 from olpm_bench.bench.config import ConfigError, Experiment
-from olpm_bench.bench.results import Reference, Results, write_reference
+from olpm_bench.bench.reference_file import Reference, write_reference
+from olpm_bench.bench.results import Results
 from olpm_bench.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,7 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from olpm_bench.bench import experiment_file, metrics, run
-from olpm_bench.bench.results import Reference, Results, write_reference
+from olpm_bench.bench.reference_file import Reference, write_reference
+from olpm_bench.bench.results import Results
 from olpm_bench.cli import app
 
 TOML = """

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from olpm_bench.bench import cell, experiment_file, reference
+from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.lock import LockedError, locked
-from olpm_bench.bench.results import ResultError, read_reference
+from olpm_bench.bench.reference_file import read_reference
 
 TOML = """
 title = "Test"

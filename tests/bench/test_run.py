@@ -14,8 +14,10 @@ from small_experiment import TOML
 from olpm_bench.bench import experiment_file, run
 from olpm_bench.bench.cell import CellFailedError
 from olpm_bench.bench.config import Experiment
+from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.lock import locked
-from olpm_bench.bench.results import Reference, ResultError, Results, write_reference
+from olpm_bench.bench.reference_file import Reference, write_reference
+from olpm_bench.bench.results import Results
 
 
 @pytest.fixture

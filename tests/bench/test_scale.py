@@ -8,7 +8,9 @@ import pytest
 
 from olpm_bench.bench import config, experiment_file, run, scale
 from olpm_bench.bench.config import ConfigError
-from olpm_bench.bench.results import Reference, ResultError, Results, write_reference
+from olpm_bench.bench.files import ResultError
+from olpm_bench.bench.reference_file import Reference, write_reference
+from olpm_bench.bench.results import Results
 
 TOML = """
 title = "Test"

@@ -11,7 +11,9 @@ import pytest
 from rich.console import Console
 
 from olpm_bench.bench import config, experiment_file, metrics, statistics, summary
-from olpm_bench.bench.results import Reference, ResultError, Results
+from olpm_bench.bench.files import ResultError
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Results
 from olpm_bench.transport.settings import IntegratorSettings
 
 KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "mape", "smape", "relmse", "relmse_trimmed", "flip", "ssim_error",

@@ -27,7 +27,7 @@ def read(kind: str, path: str) -> None:
     import numpy as np
 
     from olpm_bench.bench import compare, fit
-    from olpm_bench.bench.results import read_reference
+    from olpm_bench.bench.reference_file import read_reference
     from olpm_bench.transport.guide import Guide
 
     if kind == "scene":

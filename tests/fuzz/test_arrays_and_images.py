@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mutations import NUMBERS, examples, mutated_bytes, tables
 
-from olpm_bench.bench.results import write_exr
+from olpm_bench.bench.exr import write_exr
 from olpm_bench.transport.cache import SPLIT, RecordCache
 from olpm_bench.transport.guide import Guide
 from representations.interface import ParticleBatch

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 WATCH = """
 import collections, dataclasses, json, os, sys
 folder, *files = sys.argv[1:]
-from olpm_bench.bench import environment, experiment_file, results
+from olpm_bench.bench import environment, experiment_file, exr
 environment.select_variant()
 from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
@@ -41,9 +41,9 @@ def hook(event, arguments):
         seen.append([event, str(arguments)])
 sys.addaudithook(hook)
 for file in files:
-    read = {".toml": experiment_file.load, ".npz": Guide.load, ".xml": scene_load.load, ".exr": results.read_exr}
+    read = {".toml": experiment_file.load, ".npz": Guide.load, ".xml": scene_load.load, ".exr": exr.read_exr}
     try:
-        read[os.path.splitext(file)[1]](results.Path(file))
+        read[os.path.splitext(file)[1]](exr.Path(file))
     except ValueError as error:
         print(error, file=sys.stderr)
 print(json.dumps(seen))

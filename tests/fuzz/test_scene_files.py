@@ -63,7 +63,7 @@ def process():
 def folder(tmp_path_factory) -> Path:
     import numpy as np
 
-    from olpm_bench.bench.results import write_exr
+    from olpm_bench.bench.exr import write_exr
     folder = tmp_path_factory.mktemp("scenes")
     write_exr(folder / "picture.exr", {"mean": np.ones((4, 8, 3), np.float32)})
     (folder / "square.ply").write_bytes(PLY)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from olpm_bench.bench import experiment_file
-from olpm_bench.bench.results import Reference, Results
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Results
 
 NOISE = {"Path tracing": 0.5, "Quick & dirty": 0.2}         # standard deviation of a pixel after 1 s
 TRAINING = {"Path tracing": 0.0, "Quick & dirty": 1.5}      # [s]

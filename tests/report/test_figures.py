@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from skimage.io import imread
 
 from olpm_bench.bench import config, statistics, summary
-from olpm_bench.bench.results import ResultError
+from olpm_bench.bench.files import ResultError
 from olpm_bench.report import figures, sheet
 
 TIMES = np.geomspace(1, 16, 9)

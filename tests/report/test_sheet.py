@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from skimage.io import imread
 
-from olpm_bench.bench.results import ResultError
+from olpm_bench.bench.files import ResultError
 from olpm_bench.report import figures, sheet, tonemap
 
 RNG = np.random.default_rng(1)

@@ -11,7 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from skimage.io import imread
 
 from olpm_bench.bench import experiment_file
-from olpm_bench.bench.results import Reference, ResultError, Results
+from olpm_bench.bench.files import ResultError
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Results
 from olpm_bench.report import figures, sweeps
 
 TRUTH = np.ones((6, 8, 3), np.float32)
