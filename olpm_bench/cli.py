@@ -242,7 +242,8 @@ def reference(experiment: ExperimentFile, results: ResultsFolder = Path("results
     environment.select_variant()
     from olpm_bench.bench import reference as references
 
-    references.improve(loaded, results, seconds)
+    if not references.improve(loaded, results, seconds):
+        print(f"nothing to make: each scene of {experiment.name} names its reference or does without")
 
 
 @command

@@ -225,6 +225,12 @@ def test_reference_makes_what_run_asks_for(experiment, tmp_path):
 
 # ---------------------------------------------------------------- render
 
+def test_no_reference_to_make_is_said(tmp_path):
+    (tmp_path / "test.toml").write_text(BOTH)
+    done = call("reference", tmp_path / "test.toml", "--results", tmp_path / "results")
+    assert done.exit_code == 0 and done.stdout.startswith("nothing to make") and not (tmp_path / "results").exists()
+
+
 def test_render_writes_an_image_and_ends_with_json(tmp_path):
     out = tmp_path / "box.exr"
     result = call("render", "cornell_box", "--method", "unguided", "--set", "scene.light_size=0.4", "--set",
