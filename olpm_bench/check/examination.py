@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from scipy import stats
 
-from olpm_bench.bench.config import slug
+from olpm_bench.bench.files import slug
 from olpm_bench.bench.progress import Bar
 from olpm_bench.check import suite
 from olpm_bench.check.suite import LEVEL, Check, Outcome, Subject
