@@ -1,6 +1,6 @@
 """olpm-bench: one guided path tracer for Mitsuba 3, and what it takes to measure which guide is best.
 
-As a library, after `mi.set_variant`:
+As a library, imported before `mitsuba` and `drjit` so that these find a libLLVM that works, and after `mi.set_variant`:
 
     guide = olpm_bench.train(scene, "gaussian_mixture", camera_passes=24)
     image = mi.render(scene, integrator=olpm_bench.integrator(guide, max_depth=13), spp=64)
@@ -59,7 +59,8 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
     Args:
         representation: a registered name, or ``{"type": name, ...hyper-parameters}``.
         max_depth: of the camera paths to be guided [segments].
-        preset, settings: of `olpm_bench.transport.settings.TrainingSettings`: passes, photons, importons, gather, ...
+        preset, settings: of `olpm_bench.transport.settings.TrainingSettings`: passes, photons, importons, gather, ...  All passes
+            are done: `share`, `blend` and `while_rendering` concern the budgets of `olpm-bench run` only.
         integrator: of `IntegratorSettings`, for the passes of camera paths: roulette, fraction, ...
 
     Returns:
@@ -72,13 +73,14 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
                           options.integrator(preset, max_depth=max_depth, **integrator or {}), seed=seed)
 
 
-def integrator(guide: Guide | None = None, **settings: Any) -> GuidedPathIntegrator:
+def integrator(guide: Guide | None = None, preset: str = "best", **settings: Any) -> GuidedPathIntegrator:
     """A path tracer with a guide, or an unguided one.
 
     Args:
+        preset: the one that the guide was trained with brings its roulette.
         settings: of `olpm_bench.transport.settings.IntegratorSettings`: max_depth, roulette, rr_depth, window, fraction.
     """
     register()
     from olpm_bench.transport.path import GuidedPathIntegrator
-    from olpm_bench.transport.settings import IntegratorSettings, with_changes
-    return GuidedPathIntegrator(with_changes(IntegratorSettings(), settings), guide)
+    from olpm_bench.transport.settings import integrator as of_preset
+    return GuidedPathIntegrator(of_preset(preset, **settings), guide)

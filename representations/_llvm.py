@@ -55,6 +55,13 @@ def version_of(library: Path) -> int | None:
     return OLDEST - 2 if hasattr(loaded, "LLVMContextCreate") else None
 
 
+def loaded_version() -> int | None:
+    """Major version of the libLLVM that Dr.Jit has loaded; None if it was not imported yet, or has found none."""
+    drjit = sys.modules.get("drjit")
+    version = drjit.detail.llvm_version()[0] if drjit is not None else -1
+    return version if version >= 0 else None
+
+
 def wheel_library() -> Path | None:
     """The libLLVM that the wheel installed into this environment."""
     try:
@@ -93,8 +100,12 @@ def select() -> None:
     the variable names no file, so that Dr.Jit reports a missing library instead of crashing.
 
     Raises:
-        LLVMError: the variable names a missing file, no LLVM, or a version with which Dr.Jit crashes.
+        LLVMError: the variable names a missing file, no LLVM, or a version with which Dr.Jit crashes; or Dr.Jit was imported
+            before and has found such a version by itself.
     """
+    if (version := loaded_version()) is not None and version < OLDEST:
+        raise LLVMError(f"Dr.Jit was imported first and has loaded LLVM {version}, with which it aborts the process; import "
+                        f"olpm_bench before drjit and mitsuba, or name a libLLVM >= {OLDEST} in {VARIABLE}")
     if os.environ.get(VARIABLE, NONE) != NONE:
         library = Path(os.environ[VARIABLE])
         advice = f"unset it, or name a libLLVM >= {OLDEST}"

@@ -236,10 +236,15 @@ class _Cell:
         if statistics is None:
             return None
         self.training.append(statistics.as_dict())
-        if statistics.image is not None and enters and self.has_room(statistics.spp):
+        if statistics.image is None:
+            return statistics
+        source = f"training pass {statistics.index + 1}"
+        if enters and self.has_room(statistics.spp):
             taken = self.clock["train"].charged
             self.clock.move((taken - before) / max(taken, 1e-9) * statistics.share("trace"), "train", "render")
-            self._add(statistics.image, statistics.spp, f"training pass {statistics.index + 1}")
+            self._add(statistics.image, statistics.spp, source)
+        else:                       # what it shows has been learnt
+            check_pixels(to_numpy(statistics.image), source)
         return statistics
 
     def _add(self, rendered: mi.TensorXf, spp: int, source: str) -> None:

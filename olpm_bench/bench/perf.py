@@ -61,7 +61,7 @@ def measure(scene: str = "door_ajar", width: int = 160, height: int = 90, spp: i
                 pass
             guides[name] = training.radiance
     vertex_ns = vertex_cost(loaded, guides, spp)
-    figures["unguided_vertex_ns"] = vertex_ns.pop("unguided")
+    figures["path_vertex_ns"], figures["unguided_vertex_ns"] = vertex_ns.pop("path"), vertex_ns.pop("unguided")
     figures["guided_vertex_ns"] = vertex_ns
     figures["guided_over_unguided"] = {name: ns / figures["unguided_vertex_ns"] for name, ns in vertex_ns.items()}
     figures["peak_rss_mb"] = _peak_rss_mb()
@@ -112,7 +112,7 @@ def training_passes(scene: mi.Scene, passes: int, camera_passes: int = 0,
 
 
 def vertex_cost(scene: mi.Scene, guides: dict[str, Guide | None], spp: int) -> dict[str, float]:
-    """CPU ns a path vertex of the path tracer with each guide, without roulette."""
+    """CPU ns a path vertex of the path tracer with each guide, and of Mitsuba's own `path`; all without roulette."""
     from olpm_bench.transport.path import GuidedPathIntegrator  # whose base class exists once a variant is set
 
     class VertexCounter(GuidedPathIntegrator):
@@ -124,10 +124,12 @@ def vertex_cost(scene: mi.Scene, guides: dict[str, Guide | None], spp: int) -> d
 
     settings = options.IntegratorSettings(max_depth=MAX_DEPTH, roulette="none")
     integrators = {name: GuidedPathIntegrator(settings, guide) for name, guide in guides.items()}
+    integrators["path"] = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": MAX_DEPTH})
     pixels = int(np.prod(scene.sensors()[0].film().crop_size()))
     vertices = {name: float(_render(scene, VertexCounter(settings, guide), 8, 0).mean()) * pixels * spp
                 for name, guide in guides.items()}
-    times: dict[str, list[float]] = {name: [] for name in guides}
+    vertices["path"] = vertices["unguided"]
+    times: dict[str, list[float]] = {name: [] for name in integrators}
     for repeat in range(REPEATS + 1):
         for name, integrator in integrators.items():
             seconds = _cpu_seconds(functools.partial(_render, scene, integrator, spp, repeat))

@@ -20,7 +20,7 @@ from olpm_bench.bench.progress import Bar, is_interrupt, reason
 from olpm_bench.bench.reference_file import Reference, find_reference, read_reference
 from olpm_bench.bench.results import Cell, Results
 from olpm_bench.bench.shard import WHOLE, Shard
-from olpm_bench.transport import headroom
+from olpm_bench.transport import camera_paths, headroom
 
 LARGER = 8                  # references are averaged down by whole factors up to this
 PATIENCE = 2.0              # [s] between looks at what is in other hands
@@ -192,14 +192,18 @@ def plan(experiment: Experiment, root: Path, shard: Shard = WHOLE) -> dict[str, 
 
 
 def memory(spec: CellSpec) -> float:
-    """Estimate of the memory of a cell [GB]: Mitsuba itself, paths in flight, particles of a pass, images."""
+    """Estimate of the memory of a cell [GB]: Mitsuba itself, paths in flight, particles and vertices of a pass, images."""
     pixels = spec.scene.width * spec.scene.height
     lanes = pixels * (spp_of_pass(spec) if spec.budget.spp is not None else 16)
-    particles = 0
-    if spec.training is not None:
-        single = spec.training.passes if spec.training.schedule == "single_batch" else 1
-        particles = 8 * single * (spec.training.photons + spec.training.importons)        # about 8 hits a path
-    return (300e6 + 120 * lanes + 100 * particles + pixels * 3 * (8 * 4 + 4 * spec.budget.checkpoints)) / 1e9
+    particles, vertices = 0, 0
+    if (training := spec.training) is not None:
+        single = training.passes if training.schedule == "single_batch" else 1
+        particles = 8 * single * (training.photons + training.importons)        # about 8 hits a path
+        if training.camera_passes or training.while_rendering:
+            paths = min(max(training.camera_paths, pixels), camera_paths.MOST_PATHS)
+            vertices = camera_paths.rows_of(spec.integrator.max_depth) * paths
+    return (300e6 + 120 * lanes + 100 * particles + camera_paths.BYTES * vertices
+            + pixels * 3 * (8 * 4 + 4 * spec.budget.checkpoints)) / 1e9
 
 
 def require_memory(cells: Sequence[CellSpec]) -> None:

@@ -21,9 +21,12 @@ import drjit as dr
 import mitsuba as mi
 
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.headroom import require
 from olpm_bench.transport.particles import UNBOUNDED_DEPTH, Particles, places
+from olpm_bench.transport.settings import InputError
 
-MOST_PATHS = 2 ** 18        # kept of a pass; a vertex takes 144 bytes
+MOST_PATHS = 2 ** 18        # kept of a pass
+BYTES = 144                 # of a vertex
 
 
 def wanted(nee: mi.Float, value: mi.Float, reflected: mi.Float) -> mi.Float:
@@ -42,6 +45,11 @@ def wanted(nee: mi.Float, value: mi.Float, reflected: mi.Float) -> mi.Float:
     return dr.select((reflected > 0) & (value > 0), dr.maximum(1 - nee * reflected / value, 0), 0)
 
 
+def rows_of(max_depth: int) -> int:
+    """Vertices of a path that are kept, at most."""
+    return max((max_depth if max_depth >= 0 else UNBOUNDED_DEPTH) - 1, 1)
+
+
 class CameraPaths:
     """Vertices of the paths of one image, at most `max_depth` - 1 a path; those of `MOST_PATHS` paths in even spacing.
 
@@ -51,6 +59,9 @@ class CameraPaths:
     Args:
         pixels, spp, paths_a_lane: of the image.
         max_depth: longest path [segments]; -1: no limit, and vertices beyond `UNBOUNDED_DEPTH` are not kept.
+
+    Raises:
+        InputError: more vertices than there is memory for, or than 32 bits can count.
     """
 
     def __init__(self, pixels: int, spp: int, max_depth: int, paths_a_lane: int = 1) -> None:
@@ -60,7 +71,12 @@ class CameraPaths:
         stride = -(-pixels * spp // MOST_PATHS)
         kept = (pixels + stride - 1) // stride
         self.n_paths = kept * spp
-        self.rows = max((max_depth if max_depth >= 0 else UNBOUNDED_DEPTH) - 1, 1)
+        self.rows = rows_of(max_depth)
+        if 8 * self.rows * self.n_paths >= 2 ** 32:
+            raise InputError(f"{self.n_paths} camera paths of up to {self.rows} vertices in one pass: at most "
+                             f"{(2 ** 32 - 1) // (8 * self.rows)}; a smaller max_depth, fewer camera_paths")
+        require(BYTES * self.rows * self.n_paths, f"the vertices of {self.n_paths} camera paths of up to {self.rows} each",
+                "a smaller max_depth, fewer camera_paths")
         opaque = dr.opaque(mi.UInt32, stride)
         self.kept = pixel % opaque == 0
         first = (lane - pixel * dr.opaque(mi.UInt32, lanes)) * dr.opaque(mi.UInt32, paths_a_lane)
@@ -103,16 +119,20 @@ class CameraPaths:
         n = dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))
         weight = weight * share * dr.maximum(dr.dot(n, ds.d), 0)
         dr.scatter(self.position, mi.Vector4f(si.p.x, si.p.y, si.p.z, weight), place, active)
-        dr.scatter(self.direction, mi.Vector4f(ds.d.x, ds.d.y, ds.d.z, ds.dist), place, active)
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)      # as a ray that leaves the scene: see `arrive`
+        dr.scatter(self.direction, mi.Vector4f(ds.d.x, ds.d.y, ds.d.z, dr.select(far, dr.inf, ds.dist)), place, active)
         dr.scatter(self.normal, mi.Vector4f(n.x, n.y, n.z, -1), place, active)
 
     def leave(self, path: mi.UInt32, depth: mi.UInt32, si: mi.SurfaceInteraction3f, bsdf: GuidedBSDF, bs: mi.BSDFSample3f,
               weight: mi.Spectrum, survive: mi.Float, reflected: mi.Spectrum, active: mi.Bool) -> None:
-        """A vertex and its continuation, of which `weight` is 0 where roulette has ended the path."""
+        """A vertex and its continuation, of which `weight` is 0 where roulette has ended the path.
+
+        Where the BSDF is all specular the normal is 0: no record will be of use there.
+        """
         active = active & self.kept & (depth < self.rows)
         path = self.first + path * self.a_sample
         place = depth * self.n + path
-        n = dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))
+        n = dr.select(bsdf.smooth, dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))), 0)
         learnable = (dr.max(weight) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         cosine = dr.maximum(dr.dot(n, si.to_world(bs.wo)), 0)
         per_pdf = dr.select(learnable, cosine / (bs.pdf * survive), 0)

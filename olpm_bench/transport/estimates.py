@@ -3,7 +3,8 @@
 * the mean weight of the particles of each source, photons (or importons) and camera paths: weights are divided by it, so
   that the sources, whose units differ, teach one distribution, each particle by its share of its own source;
 * the fluence of its photons (importons): their weight per emitted particle and area, for the window of particles;
-* the radiance that its surface returns on the average, next-event estimation left out, for the roulette;
+* the radiance that its surface returns on the average, next-event estimation left out, for the roulette, and with it, for the
+  share of direct light that is learnt;
 * the BSDF fraction: the probability with which the directions that bring that radiance were chosen by the BSDF.  As the
   weight of a mixture of two densities it is learnt by stepwise EM like the others, c' = sum w gamma_bsdf / sum w, which
   minimises the KL divergence of the mixture from the product f L cos.
@@ -54,7 +55,7 @@ class Estimates:
         return len(self.visits)
 
     def learn_fluence(self, batch: ParticleBatch, norm: mi.Float) -> None:
-        """From the particles of one pass; `norm` is the area of each record times the particles emitted."""
+        """From the particles of one pass; `norm` is the area that each record took them from, times the particles emitted."""
         self.passes = self.passes + 1
         self.fluence = dr.lerp(self.fluence, batch.sums() / norm, dr.rcp(self.passes))
         dr.eval(self.passes, self.fluence)

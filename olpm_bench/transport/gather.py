@@ -31,8 +31,11 @@ class Gathered(ParticleBatch):
 
     extent: validity radius with which a record would get just `neighbours` particles, at most r_max [n_records, scene
         units]: R_ph.  Of `nearest`, the distance of the farthest [L]; of `binned`, R sqrt(neighbours / found).
+    reach: radius of the disk that they were taken from [n_records, scene units].  Of `binned`, the record's own; of `nearest`,
+        `extent`.
     """
     extent: mi.Float
+    reach: mi.Float
 
 
 def binned(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
@@ -54,8 +57,9 @@ def binned(cache: RecordCache, particles: Particles, neighbours: int, parallax: 
     place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, order, chosen))
     i, wanted = dr.arange(mi.UInt32, len(cache)), dr.opaque(mi.Float, neighbours)
     found = dr.maximum(dr.gather(mi.UInt32, offset, i + 1) - dr.gather(mi.UInt32, offset, i), 1)
-    extent = cache.row(i)[3] * dr.sqrt(wanted / mi.Float(found))
-    return _batch(cache, particles, place, dr.gather(mi.UInt32, record, chosen), stands_for, extent, parallax)
+    reach = cache.row(i)[3]
+    extent = reach * dr.sqrt(wanted / mi.Float(found))
+    return _batch(cache, particles, place, dr.gather(mi.UInt32, record, chosen), stands_for, extent, reach, parallax)
 
 
 def nearest(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
@@ -75,7 +79,7 @@ def nearest(cache: RecordCache, particles: Particles, neighbours: int, parallax:
     by_path = dr.argsort(hit)               # not by voxel: see Particles
     order, record, _ = group(dr.gather(mi.UInt32, record, by_path), len(cache))
     place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, hit, dr.gather(mi.UInt32, by_path, order)))
-    return _batch(cache, particles, place, record, mi.Float(1), extent, parallax)
+    return _batch(cache, particles, place, record, mi.Float(1), extent, extent, parallax)
 
 
 def by_record(cache: RecordCache, particles: Particles) -> tuple[mi.UInt32, mi.UInt32]:
@@ -90,11 +94,12 @@ GATHERS = {"binned": binned, "nearest": nearest}
 
 
 def _nothing(cache: RecordCache) -> Gathered:
-    return Gathered(**vars(ParticleBatch.empty(len(cache))), extent=dr.full(mi.Float, cache.radius, len(cache)))
+    radius = dr.full(mi.Float, cache.radius, len(cache))
+    return Gathered(**vars(ParticleBatch.empty(len(cache))), extent=radius, reach=radius)
 
 
 def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: mi.UInt32, stands_for: mi.Float,
-           extent: mi.Float, parallax: bool) -> Gathered:
+           extent: mi.Float, reach: mi.Float, parallax: bool) -> Gathered:
     """A batch of chosen particles, already grouped by record, with directions (and for `parallax` positions) in their frames.
 
     Raises:
@@ -105,7 +110,8 @@ def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: m
     frame = mi.Frame3f(normal)
     batch = Gathered(frame.to_local(d), weight * stands_for, distance, record, offsets(record, len(cache)),
                      frame.to_local(p - position) if parallax else None,
-                     extent=dr.minimum(extent, dr.opaque(mi.Float, cache.radius)))
+                     extent=dr.minimum(extent, dr.opaque(mi.Float, cache.radius)),
+                     reach=dr.minimum(reach, dr.opaque(mi.Float, cache.radius)))
     finite = dr.all(dr.isfinite(batch.weight))
     dr.eval(batch, finite)
     if not finite:

@@ -35,6 +35,7 @@ class GuidedPoint:
         valid: there is a record, and it has seen enough particles.
         fraction: its learnt BSDF fraction; 0: not learnt.
         outgoing: the mean radiance that it returns; -1: not known.
+        reflected: and that with next-event estimation; 0: not known, or not asked for (`direct`).
         at: the point in the record's frame, or None without parallax.
     """
 
@@ -76,7 +77,7 @@ class Guide:
         self.state = self.representation.init(0, 0, parallax)
         self.count = dr.zeros(mi.UInt32, 0)     # particles seen by each record, or by the one that it began as a copy of
         self.estimates = Estimates.nothing(0)
-        self.rows = mi.Float()                  # [n_records * 4] for queries: has seen enough, fraction, outgoing; unused
+        self.rows = mi.Float()                  # [n_records * 4] for queries: has seen enough, fraction, outgoing, reflected
         self.pixels: PixelEstimate | None = None        # of the camera that the guide was trained for
         self.particles = 0                      # particles stored over all passes
         self.wanted = np.zeros(0, np.float32)   # radii that the last measured batch asks for [scene units]
@@ -130,10 +131,13 @@ class Guide:
             for f in fields(state):
                 setattr(state, f.name, states.copy_records(getattr(state, f.name), self.records, source, target))
 
-    def learn_particles(self, batch: ParticleBatch, seed: int, emitted: int = 1) -> None:
-        """One on-line update with the photons or importons of one pass, of which so many were `emitted`."""
+    def learn_fluence(self, batch: Gathered, emitted: int) -> None:
+        """What the photons or importons of one pass, of which so many were `emitted`, tell of the fluence."""
+        self.estimates.learn_fluence(batch, dr.square(batch.reach) * dr.opaque(mi.Float, emitted))
+
+    def learn_particles(self, batch: ParticleBatch, seed: int) -> None:
+        """One on-line update with the photons or importons of one pass."""
         if len(batch):
-            self.estimates.learn_fluence(batch, self.areas() * dr.opaque(mi.Float, emitted))
             self._update(self.estimates.normalise_particles(batch), seed)
 
     def learn_camera(self, batch: ParticleBatch, returned: mi.Float, chosen_by_bsdf: mi.Float, reflected: mi.Float,
@@ -171,7 +175,7 @@ class Guide:
         return dr.gather(mi.Float, self.estimates.fluence, record, found)
 
     def areas(self) -> mi.Float:
-        """Area from which each record takes its particles, up to a factor [scene units^2]."""
+        """Area that each record serves, up to a factor [scene units^2]."""
         return copied(mi.Float, self.cache.radii ** 2)
 
     def measure(self, batch: Gathered) -> None:

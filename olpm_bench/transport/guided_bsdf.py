@@ -34,6 +34,7 @@ class GuidedBSDF:
 
     Attributes:
         outgoing: mean radiance (luminance) that the record's surface returns, without next-event estimation; < 0: not known.
+        reflected: and with it; 0: not known, see :func:`~olpm_bench.transport.camera_paths.wanted`.
         chosen_by_bsdf: of the last sample, the probability that the BSDF chose it, c p_bsdf / p; -1 where c = 1 or it failed.
     """
 

@@ -74,7 +74,8 @@ class TrainingSettings:
     camera_passes: at most so many passes of camera paths, which render the image and teach the guide.
     camera_paths: paths of such a pass: as many samples a pixel, rounded to a power of two, as come nearest; at least one.
     share: of a budget in seconds, after which training ends; 1: with its last pass, or with the budget.  "auto": when learning
-        on is expected to cost more variance than it saves, at most half of the budget; see `bench.cell.end_of_training`.
+        on is expected to cost more variance than it saves, at most half of the budget; see `bench.cell.end_of_training`, which
+        alone knows of budgets, and so of `blend` and `while_rendering`.
     blend: let the images of camera passes of the second half of training into the result, sample for sample.
     while_rendering: go on learning from the paths of every rendering pass.
     gather: "binned": the particles whose look-up gives the record, at most `neighbours` of them;
@@ -89,8 +90,9 @@ class TrainingSettings:
     emission: "guided" starts photons of lights at infinity (constant, envmap, sunsky, directional) where importons leave for
         them; "emitter" by the emitters' own samplers.
     emission_fraction: probability of the emitter's own sampler in guided emission, its defensive share [T 113-117].
-    weight_window: what the particles' roulette and splitting keep alike: "contribution", that which they are expected to make to
-        the image, or to the light that it receives (Vorba and Křivánek 2016); "flux", their weights, in a wide window [L].
+    weight_window: what the particles' roulette and splitting keep alike: "contribution", their weights times a power of the
+        contribution that they are expected to make to the image, or to the light that it receives (`transport.window`, after
+        Vorba and Křivánek 2016); "flux", their weights, in a wide window [L].
     parallax: representations re-aim at what they have learnt from the point where they are asked, not from their record's.
     """
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
@@ -137,13 +139,14 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
     _require(getattr(settings, name) in choices, name, getattr(settings, name), f"{', '.join(most)} or {last}")
 
 
-# The talk's particles, gather and schedule [T, L]: photons and importons only, a fixed fraction.
+# Photons and importons only, a fixed fraction; gather and particles of a pass are those of the paper's library [L], the talk
+# has 30 passes of 100,000 photons and as many importons [T].
 _PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "photons": 300_000, "importons": 300_000,
           "camera_passes": 0, "learn_fraction": False, "weight_window": "flux", "fraction": 0.5, "parallax": False}
 
 # What each preset changes of the defaults, which are those of `best`.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "best": {"training": {}, "integrator": {}},
+    "best": {"training": {}, "integrator": {"roulette": "contribution"}},
     "paper2014": {"training": _PAPER, "integrator": {"roulette": "throughput"}},
     "paper2014_norr": {"training": _PAPER, "integrator": {"roulette": "none"}},      # guided paths carry low throughput
 }

@@ -256,7 +256,9 @@ class Training:
         with _Seconds(statistics, "gather"):
             batch = GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours, self.settings.parallax)
         with _Seconds(statistics, "update"):
-            guide.learn_particles(batch, self._next_seed(), emitted)
+            if len(batch):
+                guide.learn_fluence(batch, emitted)
+            guide.learn_particles(batch, self._next_seed())
             if self.settings.shrink:
                 guide.measure(batch)
         return len(batch)
@@ -273,16 +275,15 @@ class Training:
         if len(vertices):
             with _Seconds(statistics, "grow"):
                 p, _, _, _, n = vertices.read(vertices.place)
-                guide.grow(p, n, mi.Bool(True), self._next_seed())
+                guide.grow(p, n, dr.squared_norm(n) > 0, self._next_seed())
             with _Seconds(statistics, "gather"):
                 batch = binned(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
             if len(place):          # a record serves some of them
                 with _Seconds(statistics, "update"):
                     guide.learn_camera(batch, *paths.returned(place), offset, self._next_seed())
+                statistics.seen = float(np.mean(guide.count.numpy()[np.diff(offset.numpy().astype(np.int64)) > 0]))
             statistics.kept = len(batch)
-            if len(batch):
-                statistics.seen = float(np.mean(guide.count.numpy()[batch.count().numpy() > 0]))
         else:
             statistics.warnings.append("the camera sees no surface: there is nothing to guide")
         self._estimate_pixels(image, spp)

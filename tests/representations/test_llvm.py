@@ -116,6 +116,15 @@ def test_the_wheel_is_found_and_works() -> None:
     assert Path(library) == _llvm.wheel_library() and float(result) == 3, process.stderr
 
 
+def test_drjit_that_came_first_and_has_loaded_an_old_version() -> None:
+    """What it says of its version is made up: there may be no such library here."""
+    process = run("import drjit; drjit.detail.llvm_version = lambda: (15, 0, 6)\nimport representations")
+    assert process.returncode == 1 and "LLVMError: Dr.Jit was imported first and has loaded LLVM 15" in last_line(process)
+    harmless = "import drjit; drjit.detail.llvm_version = lambda: ({}, -1, -1)\nimport representations"
+    for version in (-1, 19):
+        assert run(harmless.format(version)).returncode == 0
+
+
 def test_variable_that_works_is_kept() -> None:
     library = str(_llvm.require())
     program = "import representations; print(representations._llvm.require())"

@@ -8,9 +8,10 @@ import drjit as dr
 import numpy as np
 from scipy import stats
 
-from olpm_bench.check.small_scenes import blocks, box, camera, furnace, grey, lamp, passes, wall
+from olpm_bench.check.small_scenes import RESOLUTION, blocks, box, camera, furnace, grey, lamp, passes, wall
 
-__all__ = ["assert_no_kernel_a_pass", "assert_same_expectation", "box", "camera", "furnace", "grey", "lamp", "passes", "wall"]
+__all__ = ["RESOLUTION", "assert_no_kernel_a_pass", "assert_same_expectation", "box", "camera", "furnace", "grey", "lamp",
+           "passes", "wall"]
 
 
 def assert_same_expectation(a: np.ndarray, b: np.ndarray, level: float = 0.01, size: int = 2) -> None:

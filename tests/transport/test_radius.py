@@ -69,7 +69,7 @@ def test_radius_follows_the_formula(distance, extent, expected):
     x = mi.Point3f([0.1, 0.9], [0.1, 0.9], [0, 0])
     cache.grow(x, mi.Normal3f(0, 0, 1) + dr.zeros(mi.Normal3f, 2), mi.Bool(True))
     lobes = _lobes([0.1, 0.1], np.array([0, 0, 1.0]), distance * cache.radius)
-    batch = Gathered(**vars(lobes), extent=dr.full(mi.Float, extent * cache.radius, 2))
+    batch = Gathered(**vars(lobes), extent=dr.full(mi.Float, extent * cache.radius, 2), reach=dr.full(mi.Float, cache.radius, 2))
     radius = wanted(cache, batch) / cache.radius
     np.testing.assert_allclose(radius, expected, rtol=0.25)
 
@@ -79,5 +79,5 @@ def test_records_without_particles_stay_and_undersampled_ones_do_not_shrink():
     cache.grow(mi.Point3f([0.1, 0.9], [0.1, 0.9], [0, 0]), mi.Normal3f(0, 0, 1) + dr.zeros(mi.Normal3f, 2), mi.Bool(True))
     few = ParticleBatch.from_arrays(mi.Vector3f(0, 0, 1) + dr.zeros(mi.Vector3f, 20), dr.ones(mi.Float, 20),
                                     dr.zeros(mi.UInt32, 20), 2, dr.full(mi.Float, 1e-6, 20))
-    batch = Gathered(**vars(few), extent=dr.full(mi.Float, 0.8 * cache.radius, 2))
+    batch = Gathered(**vars(few), extent=dr.full(mi.Float, 0.8 * cache.radius, 2), reach=dr.full(mi.Float, cache.radius, 2))
     np.testing.assert_allclose(wanted(cache, batch) / cache.radius, [0.8, 1], rtol=1e-5)
