@@ -67,12 +67,13 @@ class Guide:
         fraction: initial BSDF fraction of records that learn it; None: they do not.
         parallax: tell the representation where around a record it is asked, and where its particles landed.
         direct: learn direct light that next-event estimation finds too rarely.
+        inherit: new records begin with what those beside them have learnt.
     """
 
     def __init__(self, cache: RecordCache, specification: dict[str, Any], fraction: float | None = None,
-                 parallax: bool = False, direct: bool = False) -> None:
+                 parallax: bool = False, direct: bool = False, inherit: bool = True) -> None:
         self.cache, self.specification, self.fraction, self.parallax = cache, specification, fraction, parallax
-        self.direct = direct
+        self.direct, self.inherit = direct, inherit
         self.representation = representations.create(**specification)
         self.state = self.representation.init(0, 0, parallax)
         self.count = dr.zeros(mi.UInt32, 0)     # particles seen by each record, or by the one that it began as a copy of
@@ -106,7 +107,7 @@ class Guide:
     # ---------------------- Learning ----------------------
 
     def grow(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, seed: int) -> None:
-        """Add records where the points have none: what the record beside them has learnt, if it has the same frame."""
+        """Add records where the points have none."""
         before, added = self.records, self.cache.grow(p, n, active)
         if added:
             each = self.bytes_per_record if before else states.bytes_of(self.representation.init(2, 0, self.parallax)) / 2
@@ -115,12 +116,14 @@ class Guide:
             self.state = states.append(self.state, self.representation.init(added, seed, self.parallax))
             self.count = states.join(self.count, dr.zeros(mi.UInt32, added))
             self.estimates = states.append(self.estimates, Estimates.nothing(added))
-            self._inherit(before)
+            if self.inherit:
+                self._inherit(before)
             dr.eval(self.state, self.count, self.estimates)
             self._tabulate()
 
     def _inherit(self, first: int) -> None:
-        """Copy to the records from number `first` on what the older ones beside them have learnt, and their count."""
+        """Copy to the records from number `first` on what the older ones beside them, of the same frame, have learnt, and their
+        count."""
         parent = self.cache.parents(first)
         child = np.flatnonzero(parent >= 0)
         if len(child) < 2:                      # a single one stays untrained: arrays of one entry compile other kernels

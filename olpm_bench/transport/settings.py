@@ -84,6 +84,7 @@ class TrainingSettings:
     record_radius: largest validity radius of a record, in units of the scene's diagonal [L: 0.01].
     shrink: records shrink from there, to a tenth at most, where particles are dense, sources near or lobes sharp, as in the
         paper; off by default: at equal time it costs more than it gains.
+    inherit: new records begin with what those beside them have learnt.
     fraction: probability of sampling the BSDF rather than the guide when particles scatter.
     learn_fraction: learn it from camera paths, record by record, for camera paths and importons.
     learn_direct: from camera paths, learn the direct light too that next-event estimation samples more rarely than it brings.
@@ -109,6 +110,7 @@ class TrainingSettings:
     neighbours: int = 250
     record_radius: float = 0.02
     shrink: bool = False
+    inherit: bool = True
     fraction: float = 0.4
     learn_fraction: bool = True
     learn_direct: bool = True

@@ -145,8 +145,9 @@ class Training:
         self.bounds = bounds = surface_bounds(scene)
         self.radiance = Guide(RecordCache(bounds, settings.record_radius), specification,
                               integrator.fraction if settings.learn_fraction else None, settings.parallax,
-                              settings.learn_direct)
-        self.importance = Guide(RecordCache(bounds, settings.record_radius), specification, parallax=settings.parallax)
+                              settings.learn_direct, settings.inherit)
+        self.importance = Guide(RecordCache(bounds, settings.record_radius), specification, parallax=settings.parallax,
+                                inherit=settings.inherit)
         self.integrator = GuidedPathIntegrator(integrator, self.radiance)
         self.luminance: np.ndarray | None = None        # of the mean of all camera passes so far (h, w), ...
         self.spp = 0                                    # ... and their samples a pixel

@@ -23,6 +23,7 @@ SWITCHED = {                                # preset, training, integrator
     "no camera paths": ("best", {"camera_passes": 0}, {}),
     "one fraction": ("best", {"learn_fraction": False}, {}),
     "direct light not learnt": ("best", {"learn_direct": False}, {}),
+    "new records untrained": ("best", {"inherit": False}, {}),
     "no parallax": ("best", {"parallax": False}, {}),
     "emitters' own photons": ("best", {"emission": "emitter"}, {}),
     "window by flux": ("best", {"weight_window": "flux"}, {}),
