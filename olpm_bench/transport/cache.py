@@ -370,7 +370,6 @@ class RecordCache:
             cache._assign(np.zeros(len(cache.cells), bool))
         return cache
 
-
     def _stored_table(self, arrays: dict[str, Any]) -> np.ndarray:
         """The table that `to_numpy` described, if all that look-ups read in it exists."""
         size, roots, k = int(arrays["table_size"]), self.grid.n_cells, len(arrays["table_used"])

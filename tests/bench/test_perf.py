@@ -27,8 +27,8 @@ def test_figures_of_the_issue(monkeypatch):
     assert {"trace", "gather", "update"} <= figures["pass_seconds"].keys() == figures["pass_seconds_nearest"].keys()
     assert figures["camera_pass_seconds"].keys() == figures["pass_seconds"].keys() and len(figures["camera_rss_mb_by_pass"]) == 3
     assert figures["guided_vertex_ns"].keys() == {"cosine", "gaussian_mixture"} and len(figures["rss_mb_by_pass"]) == 3
-    for value in (figures["em_ns_per_particle"], figures["path_vertex_ns"], figures["unguided_vertex_ns"], *figures["guided_vertex_ns"].values(),
-                  figures["peak_rss_mb"]):
+    for value in (figures["em_ns_per_particle"], figures["path_vertex_ns"], figures["unguided_vertex_ns"],
+                  *figures["guided_vertex_ns"].values(), figures["peak_rss_mb"]):
         assert value > 0 and math.isfinite(value)
 
 
