@@ -148,6 +148,5 @@ def test_every_preset_runs_in_every_experiment(tmp_path, name, preset):
     spec = dataclasses.replace(found, training=dataclasses.replace(found.training, **few),
                                scene=found.scene.model_copy(update={"width": 16, "height": 9}),
                                budget=config.Budget(spp=2, checkpoints=1))
-    scene = cell.load_scene(spec)
-    done = cell.measure(spec, scene, cell.warm_up(spec, scene))
+    done = cell.measure(spec, cell.load_scene(spec), cell.WarmUp(0.0, spp_seconds=1.0))
     assert done.info["spp"] >= 2 and done.info["records"] > 0 and np.isfinite(done.image["mean"]).all()
