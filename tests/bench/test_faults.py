@@ -123,7 +123,7 @@ FILL = """
 import resource, sys
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
-from test_faults import NAMES, files, write_cell
+from test_faults import NAMES, files_in, write_cell
 from olpm_bench.bench.lock import locked
 from olpm_bench.bench.results import Results
 for disk in sys.argv[3:]:
