@@ -146,7 +146,8 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
 _PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "photons": 300_000, "importons": 300_000,
           "camera_passes": 0, "learn_fraction": False, "weight_window": "flux", "fraction": 0.5, "parallax": False}
 
-# What each preset changes of the defaults, which are those of `best`.
+# What each preset changes of the defaults, which are those of `best`: it names its roulette, too, so that a method's own preset
+# brings it where `[integrator]` names another for all.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "best": {"training": {}, "integrator": {"roulette": "contribution"}},
     "paper2014": {"training": _PAPER, "integrator": {"roulette": "throughput"}},

@@ -276,7 +276,7 @@ class Training:
         if len(vertices):
             with _Seconds(statistics, "grow"):
                 p, _, _, _, n = vertices.read(vertices.place)
-                guide.grow(p, n, dr.squared_norm(n) > 0, self._next_seed())
+                guide.grow(p, n, dr.squared_norm(n) > 0, self._next_seed())         # not where all is specular
             with _Seconds(statistics, "gather"):
                 batch = binned(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)

@@ -242,3 +242,18 @@ def test_an_invalid_pixel_is_found_and_named(value):
     image[2, 3, 1] = value
     with pytest.raises(CellFailedError, match=r"1 pixels .* x = 3, y = 2: .*, in pass 7"):
         cell.check_pixels(image, "pass 7")
+
+
+def test_an_invalid_pixel_fails_a_cell_even_if_it_only_trains(experiment, monkeypatch):
+    text = TOML + 'representation = { type = "cosine" }\n'
+    experiment.path.write_text(text + "training = { passes = 0, camera_passes = 1, camera_paths = 200, blend = false }\n")
+    spec, learn = experiment_file.load(experiment.path).cells()[1], cell.Training._camera_pass
+
+    def broken(self, statistics):
+        done = learn(self, statistics)
+        done.image = done.image * np.nan
+        return done
+
+    monkeypatch.setattr(cell.Training, "_camera_pass", broken)
+    with pytest.raises(CellFailedError, match="in training pass 1"):
+        cell.measure(spec, cell.load_scene(spec), WarmUp(0.0, 1.0))

@@ -85,6 +85,7 @@ def test_presets_bring_their_roulette(tmp_path):
     assert roulettes(preset) == ["contribution", "none"]                    # the unguided method has no preset
     assert roulettes(preset, 'roulette = "throughput"') == ["throughput"] * 2
     assert roulettes(integrator='roulette = "throughput"', own=f"training = {{ {preset} }}") == ["throughput", "none"]
+    assert roulettes(integrator='roulette = "none"', own='training = { preset = "best" }') == ["none", "contribution"]
     assert roulettes(preset, own='integrator = { roulette = "throughput" }') == ["contribution", "throughput"]
 
 

@@ -8,8 +8,9 @@ import pytest
 from small_scenes import box, camera, grey, lamp, wall
 
 import olpm_bench
-from olpm_bench.transport import camera_paths, settings
+from olpm_bench.transport import camera_paths, headroom, settings
 from olpm_bench.transport.camera_paths import CameraPaths
+from olpm_bench.transport.settings import InputError
 from olpm_bench.transport.training import Training
 
 ALBEDO, DEPTH, SPP = 0.6, 6, 16
@@ -103,3 +104,36 @@ def test_vertices_are_bounded_and_evenly_spaced(monkeypatch, paths_a_lane):
     assert (paths.count.numpy() == paths.rows).mean() > 0.9
     first = _vertices(paths)["position"][0, :pixels, :3]
     assert np.isfinite(first).all() and len(np.unique(first, axis=0)) == pixels
+
+
+def test_the_sky_is_infinitely_far_whoever_finds_it():
+    """As a sample of the emitter and as a ray that leaves the scene: parallax must not turn its light."""
+    content = box(grey(ALBEDO), sky={"type": "constant"}, light=POINT)
+    del content["wall5"]
+    scene = mi.load_dict(content, optimize=False)
+    sensor = scene.sensors()[0]
+    few = {"passes": 1, "photons": 20_000, "importons": 10_000, "camera_passes": 3, "camera_paths": 2**13}
+    guide = olpm_bench.train(scene, max_depth=DEPTH, **few)
+    paths = CameraPaths(int(np.prod(sensor.film().crop_size())), SPP, DEPTH)
+    dr.eval(olpm_bench.integrator(guide, max_depth=DEPTH).render_paths(scene, sensor, 3, SPP, paths))
+    taught = paths.position.numpy().reshape(2, paths.rows, paths.n_paths, 4)[1, ..., 3] > 0
+    assert taught.sum() > 100
+    assert np.isinf(paths.direction.numpy().reshape(2, paths.rows, paths.n_paths, 4)[1, ..., 3][taught]).all()
+
+
+def test_mirrors_get_no_records():
+    scene = mi.load_dict(box({"type": "conductor"}, lamp=lamp()), optimize=False)
+    training = Training(scene, "jensen", settings.training(passes=0, camera_passes=2, camera_paths=2**13),
+                        settings.integrator(max_depth=DEPTH))
+    for statistics in training.run():
+        assert statistics.stored > 1000
+    points = training.radiance.cache.points[:, :3]
+    assert len(points) > 0 and np.linalg.norm(points - (0.3, 0.4, 0.7), axis=1).max() < 0.3         # all on the lamp
+
+
+def test_more_vertices_than_there_is_room_for_are_refused(monkeypatch):
+    with pytest.raises(InputError, match="a smaller max_depth"):
+        CameraPaths(2**17, 1, 10_000)
+    monkeypatch.setattr(headroom, "free", lambda: 1e6)
+    with pytest.raises(InputError, match=r"the vertices of 1024 camera paths of up to 12 each take about 0\.0018 GB"):
+        CameraPaths(1024, 1, 13)

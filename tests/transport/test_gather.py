@@ -98,3 +98,10 @@ def test_same_particles_same_batch(landed, gather):
     a, b = (gather(cache, particles, 100) for _ in range(2))
     for field in ("weight", "distance", "record", "offset"):
         np.testing.assert_array_equal(getattr(a, field).numpy(), getattr(b, field).numpy())
+
+
+def test_fluence_does_not_depend_on_how_many_are_taken(landed):
+    """Weight over the area that it fell on: with more neighbours the disk is larger."""
+    cache, particles = landed
+    few, many = (batch.sums().numpy() / batch.reach.numpy() ** 2 for batch in (nearest(cache, particles, n) for n in (60, 240)))
+    assert np.median(few / np.maximum(many, 1e-30)) == pytest.approx(1, abs=0.1)
