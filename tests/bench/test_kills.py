@@ -80,7 +80,7 @@ class Run:
                 times = watched.cpu_times()
                 self.cpu_seconds = times.user + times.system
                 if unfinished:
-                    seen |= {path for path in map(str, self.results.rglob(".*")) if ".tmp" in path}
+                    seen |= unfinished_files(self.results)
                 if self.cpu_seconds >= cpu_seconds or (unfinished and len(seen) >= unfinished):
                     self.process.kill()
                     break
@@ -89,6 +89,12 @@ class Run:
             self.process.kill()
             self.errors = self.process.communicate()[1]
         return self.process.returncode == -9
+
+
+def unfinished_files(folder: Path) -> set[str]:
+    """What is being written now.  Unlike `rglob`, `walk` goes on when a folder is renamed meanwhile."""
+    return {os.path.join(parent, name) for parent, folders, files in os.walk(folder) for name in folders + files
+            if name.startswith(".") and ".tmp" in name}
 
 
 def complete(experiment: Path, results: Path) -> dict[str, tuple[int, int]]:
