@@ -11,6 +11,7 @@ from small_scenes import assert_no_kernel_a_pass, box, grey, lamp
 
 import olpm_bench
 import representations
+from olpm_bench.scenes.load import load
 from olpm_bench.transport import settings
 from olpm_bench.transport.estimates import FLOOR
 from olpm_bench.transport.guide import Guide
@@ -196,6 +197,14 @@ def test_what_cannot_be_learnt_is_told_and_images_are_right(change, message):
     ours, theirs = (mi.render(scene, integrator=i, spp=256, seed=s).numpy() for s, i in enumerate(
         (olpm_bench.integrator(guide, max_depth=DEPTH), path)))
     assert np.isfinite(ours).all() and ours.mean() == pytest.approx(theirs.mean(), rel=0.05, abs=1e-6)
+
+
+def test_a_room_that_no_light_enters_is_told_and_black():
+    """The camera's room is closed: photons land beside it, importons never leave it."""
+    scene = load("door_ajar", {"gap": 0}, 16, 9)
+    with pytest.warns(UserWarning, match="no camera path has met light"):
+        guide = train(scene, "gaussian_mixture", SMALL, PATHS)
+    assert guide.records and not mi.render(scene, integrator=olpm_bench.integrator(guide, max_depth=DEPTH), spp=16).numpy().any()
 
 
 @pytest.mark.filterwarnings("ignore:none of")
