@@ -17,7 +17,8 @@ import importlib
 import inspect
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,6 +29,8 @@ import numpy as np
 from olpm_bench.transport.settings import InputError
 
 LARGEST = 1e6           # parameter of an embedded scene
+MOST_INCLUDES = 15      # inside each other, as in Mitsuba
+LONGEST = 4096          # characters of a scene file's parameter, which can be made of others that are made of others
 EMBEDDED = ("door_ajar", "living_room", "classroom", "cornell_box")
 
 
@@ -134,46 +137,93 @@ def read_xml(path: Path) -> ElementTree.Element:
         raise SceneError(f"scene file {path} is not well-formed XML: {error}") from error
 
 
-def with_includes(path: Path, overrides: dict[str, str]) -> dict[Path, ElementTree.Element]:
-    """A scene file and all files it includes, with their root elements.
+@dataclass(frozen=True)
+class SceneFile:
+    """An XML file as Mitsuba reads it.
+
+    root: its root element; the attributes of all elements have values in place of `$name`.
+    folders: where Mitsuba looks for the files of its spectra, one after the other.
+    """
+    root: ElementTree.Element
+    folders: tuple[Path, ...]
+
+
+def read(path: Path, overrides: dict[str, str]) -> tuple[dict[Path, SceneFile], list[str]]:
+    """A scene file and all files that it includes, and the names of their parameters.
+
+    As Mitsuba 3.9.1: a ``<default>`` holds from there on, unless there is one already; an ``<include>`` is looked for beside
+    the file that it is in, then where that one was looked for, and last in the current folder.
 
     Raises:
-        SceneError: one of them is missing or not XML.
+        SceneError: one is missing or not XML, too many include each other, a parameter is too long, or there is a ``<path>``.
     """
-    found: dict[Path, ElementTree.Element] = {}
-    queue = [path]
-    while queue:
-        file = queue.pop(0)
-        if file not in found:
-            found[file] = read_xml(file)
-            values = {**xml_parameters(found), **overrides}
-            queue += [path.parent / substitute(e.get("filename", ""), values) for e in found[file].iter("include")]
-    return found
+    found: dict[Path, SceneFile] = {}
+    names: dict[str, None] = {}
+    values = dict(overrides)
 
+    def add(file: Path, folders: tuple[Path, ...]) -> None:
+        if file in found:
+            return
+        if len(folders) > MOST_INCLUDES:
+            raise SceneError(f"scene file {path}: files include each other {MOST_INCLUDES} deep")
+        found[file] = SceneFile(read_xml(file), folders)
+        for element in found[file].root.iter():
+            for key, text in element.items():
+                names.update(dict.fromkeys(re.findall(r"\$(\w+)", text)))
+                element.set(key, substitute(text, values))
+            if element.tag == "default":
+                name, value = element.get("name", ""), element.get("value", "")
+                if len(value) > LONGEST:
+                    raise SceneError(f"scene file {file}: parameter '{name}' has {len(value)} characters, at most {LONGEST}")
+                names[name] = None
+                values.setdefault(name, value)
+            elif element.tag == "path":
+                raise SceneError(f"scene file {file}: <path> is not supported, for Mitsuba would also look for plugins there, "
+                                 "whose code it runs; write the folder into the names of files")
+            elif element.tag == "include":
+                name, inner = element.get("filename", ""), (file.parent, *folders)
+                add(located(name, inner) or file.parent / name, inner)
 
-def xml_parameters(files: dict[Path, ElementTree.Element]) -> dict[str, str]:
-    """The parameters of scene files: name -> value of ``<default>``, "" where a `$name` has none."""
-    elements = [e for root in files.values() for e in root.iter()]
-    used = {name: "" for e in elements for text in e.attrib.values() for name in re.findall(r"\$\{?(\w+)", text)}
-    return {**used, **{e.get("name", ""): e.get("value", "") for e in elements if e.tag == "default"}}
+    add(path, (path.parent, Path()))
+    return found, list(names)
 
 
 def substitute(text: str, values: dict[str, str]) -> str:
-    """`text` with its `$name` replaced."""
-    return re.sub(r"\$\{?(\w+)\}?", lambda m: values.get(m[1], m[0]), text)
+    """`text` with each `$name` replaced; where one name begins with another, the longer counts.  A `\\$` is a dollar sign."""
+    if "$" not in text:
+        return text
+    longest_first = "|".join(re.escape(name) for name in sorted(values, key=len, reverse=True)) or "(?!)"
+    return re.sub(rf"(?<!\\)\$({longest_first})", lambda m: values[m[1]], text).replace("\\$", "$")
+
+
+def located(name: str, folders: Sequence[Path]) -> Path | None:
+    """The first of the folders' files, or folders, of that name."""
+    return next((folder / name for folder in folders if exists(folder / name)), None)
+
+
+def named_files(path: Path, files: dict[Path, SceneFile]) -> Iterator[tuple[str, Path | None, bool]]:
+    """What scene files name, but for includes: the name, what Mitsuba finds by it, and whether it must be a file's.
+
+    Any string may be a file's name.  Mitsuba looks for spectra when it reads the XML, for all else when that is done.
+    """
+    for file in files.values():
+        for element in file.root.iter():
+            if element.tag == "string":
+                name = element.get("value", "")
+                yield name, located(name, files[path].folders), element.get("name") == "filename"
+            elif element.tag != "include" and "filename" in element.attrib:
+                name = element.get("filename", "")
+                yield name, located(name, file.folders), True
 
 
 def _file_content(path: Path, overrides: dict[str, str]) -> list[list[Any]]:
     """[name, SHA-256 of the contents (None: missing)] of a scene file and of all files it refers to."""
-    files = with_includes(path, overrides)
-    values = {**xml_parameters(files), **overrides}
+    files, _ = read(path, overrides)
     content: list[list[Any]] = [[f.name, _sha256(f)] for f in files]
-    for element in (e for root in files.values() for e in root.iter("string")):
-        name = substitute(element.get("value", ""), values)
-        file = path.parent / name
-        there = exists(file) and file.is_file()
-        if element.get("name") == "filename" or ("." in name and there):
-            content.append([name, _sha256(file) if there else None])
+    for name, file, must_be in named_files(path, files):
+        code = _sha256(file) if file is not None and file.is_file() else None
+        if must_be or ("." in name and code is not None):
+            content.append([name, code])
     return content
 
 

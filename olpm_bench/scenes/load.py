@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import mitsuba as mi
 
 from olpm_bench import scenes
-from olpm_bench.scenes import SceneError
+from olpm_bench.scenes import SceneError, SceneFile
 
 VARIANTS = r"(llvm|cuda)_(ad_)?rgb"
 LARGEST = 1 << 15               # pixels along a side
@@ -40,7 +39,6 @@ def load(name_or_path: str | Path, parameters: dict[str, Any] | None = None, wid
             out of its range; a variant other than RGB on LLVM or CUDA.
     """
     check_variant()
-    _check_folders(Path(name_or_path).parent if scenes.is_file(name_or_path) else Path())
     for key, size in (("width", width), ("height", height)):
         if size is not None:
             _check_size(key, size)
@@ -61,13 +59,13 @@ def check_variant() -> None:
         raise SceneError(f"Mitsuba variant {mi.variant()!r}: must be llvm_ad_rgb or cuda_ad_rgb")
 
 
-def _check_folders(folder: Path) -> None:
-    """Mitsuba looks for its plugins in the folders of the scene and of the process, too.
+def _check_folders(folders: Iterable[Path] = ()) -> None:
+    """Mitsuba looks for its plugins wherever it looks for files: in the folder of the process and in some of the scene, too.
 
     Raises:
         SceneError: there are some, whose code would be run.
     """
-    for place in {folder.resolve(), Path.cwd()}:
+    for place in {Path.cwd(), *(folder.resolve() for folder in folders)}:
         for file in place.glob("plugins/*"):
             if file.suffix in (".so", ".dylib", ".dll"):
                 raise SceneError(f"Mitsuba would run the code of {file} as a plugin; scenes are data: remove it, or go elsewhere")
@@ -84,6 +82,7 @@ def _is_integer(value: Any) -> bool:
 
 def _embedded(name: str, parameters: dict[str, Any] | None, width: int | None, height: int | None,
               max_depth: int | None) -> mi.Scene:
+    _check_folders()
     scene = scenes.build(name, parameters)
     sensor = scene["sensor"]
     size = {"width": width or sensor["film"]["width"], "height": height or sensor["film"]["height"]}
@@ -96,11 +95,10 @@ def _embedded(name: str, parameters: dict[str, Any] | None, width: int | None, h
 def _from_file(path: Path, parameters: dict[str, Any], width: int | None, height: int | None,
                max_depth: int | None) -> mi.Scene:
     values = {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in parameters.items()}
-    files = scenes.with_includes(path, values)
-    if files[path].tag != "scene":
-        raise SceneError(f"scene file {path}: its root element is <{files[path].tag}>, must be Mitsuba 3's <scene>")
-    known = scenes.xml_parameters(files)
-    _check_text(path, files, {**known, **values})
+    files, known = scenes.read(path, values)
+    if (tag := files[path].root.tag) != "scene":
+        raise SceneError(f"scene file {path}: its root element is <{tag}>, must be Mitsuba 3's <scene>")
+    _check_text(path, files)
     for key in parameters:
         if key not in known:
             raise SceneError(f"scene file {path} has no parameter '{key}'; "
@@ -114,6 +112,8 @@ def _from_file(path: Path, parameters: dict[str, Any], width: int | None, height
     mi.set_file_resolver(beside)  # type: ignore[operator]
     try:
         state = parser.parse_file(config, str(path), **values)
+        _check_folders(Path(str(folder)) for folder in list(beside)[:-len(resolver)])
+        _check_types(path, state)
         parser.transform_upgrade(config, state)
         parser.transform_resolve_references(config, state)
         _check_content(path, state)
@@ -132,21 +132,24 @@ def _from_file(path: Path, parameters: dict[str, Any], width: int | None, height
         mi.set_file_resolver(resolver)  # type: ignore[operator]
 
 
-def _check_text(path: Path, files: dict[Path, ElementTree.Element], values: dict[str, str]) -> None:
-    """Refuse what Mitsuba would run, hang on or crash at before it has parsed anything."""
-    for file, root in files.items():
-        inside, depth = list(root), 1
+def _check_text(path: Path, files: dict[Path, SceneFile]) -> None:
+    """Refuse what Mitsuba would hang on or crash at."""
+    for file, xml in files.items():
+        inside, depth = list(xml.root), 1
         while inside:
             inside, depth = [grandchild for child in inside for grandchild in child], depth + 1
         if depth > DEEPEST:
             raise SceneError(f"scene file {file}: elements inside each other {depth} deep; at most {DEEPEST}")
-        for element in root.iter():
-            kind = scenes.substitute(element.get("type", ""), values)
-            if re.search(r"[/\\.]", kind):
-                raise SceneError(f"scene file {file}: type {kind!r} is the name of no plugin")
-            name = path.parent / scenes.substitute(element.get("value", ""), values)
-            if element.tag == "string" and element.get("name") == "filename" and scenes.exists(name) and not name.is_file():
-                raise SceneError(f"scene file {file}: {name} is no file")
+    for _, named, must_be_file in scenes.named_files(path, files):
+        if must_be_file and named is not None and not named.is_file():
+            raise SceneError(f"scene file {path}: {named} is no file")
+
+
+def _check_types(path: Path, state: Any) -> None:
+    """Refuse what would be run as a plugin's code: types are looked at when Mitsuba has parsed them, so that none looks other."""
+    for node in state.nodes:
+        if re.search(r"[/\\.]", kind := node.props.plugin_name()):
+            raise SceneError(f"scene file {path}: type {kind!r} is the name of no plugin")
 
 
 def _check_meshes(path: Path, scene: mi.Scene) -> None:

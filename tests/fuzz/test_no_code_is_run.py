@@ -88,26 +88,57 @@ def test_reading_runs_nothing_but_what_is_announced(tmp_path):
     assert said.count(f"olpm-bench: runs the code of {tmp_path / 'mine.py'}") == 1
 
 
-@pytest.mark.skipif(shutil.which("cc") is None or not sys.platform.startswith("linux"), reason="needs a C compiler, and Linux")
-def test_a_library_beside_a_scene_is_not_loaded_as_a_plugin(tmp_path, monkeypatch):
-    """Mitsuba looks for plugins in the scene's folder and in the current one before its own."""
+@pytest.fixture
+def library(tmp_path) -> Path:
+    """plugins/evil.so, which makes a file RAN when it is loaded."""
+    if shutil.which("cc") is None or not sys.platform.startswith("linux"):
+        pytest.skip("needs a C compiler, and Linux")
     (tmp_path / "plugins").mkdir()
     (tmp_path / "evil.c").write_text('#include <stdio.h>\n__attribute__((constructor)) static void run(void) '
                                      f'{{ fclose(fopen("{tmp_path / "RAN"}", "w")); }}')
     subprocess.run(["cc", "-shared", "-fPIC", "-o", tmp_path / "plugins" / "evil.so", tmp_path / "evil.c"], check=True)
-    for kind in ("evil", "../plugins/evil", f"../../../../../..{tmp_path}/plugins/evil"):
-        (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/>'
-                                            f'<shape type="{kind}"/></scene>')
+    return tmp_path / "plugins" / "evil.so"
+
+
+def scene(file: Path, *parts: str) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f'<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/>{"".join(parts)}</scene>')
+    return file
+
+
+def far(library: Path) -> str:
+    """A type that names the library from wherever Mitsuba's own plugins are."""
+    return f"{'../' * 20}{library.with_suffix('').relative_to('/')}"
+
+
+def test_a_library_beside_a_scene_is_not_loaded_as_a_plugin(tmp_path, library, monkeypatch):
+    """Mitsuba looks for plugins in the scene's folder and in the current one before its own."""
+    for kind in ("evil", "../plugins/evil", far(library)):
         with pytest.raises(SceneError, match=r"Mitsuba would run the code of .*evil\.so as a plugin"):
-            load(tmp_path / "scene.xml")
-    other = tmp_path / "other"
-    other.mkdir()
-    (tmp_path / "scene.xml").rename(other / "scene.xml")
+            load(scene(tmp_path / "scene.xml", f'<shape type="{kind}"/>'))
     with pytest.raises(SceneError, match="is the name of no plugin"):
-        load(other / "scene.xml")
+        load(scene(tmp_path / "other" / "scene.xml", f'<shape type="{far(library)}"/>'))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SceneError, match=r"evil\.so as a plugin"):
         load("cornell_box")
+    assert not (tmp_path / "RAN").exists()
+
+
+def test_a_library_is_not_loaded_by_way_of_a_path_an_include_or_a_parameter(tmp_path, library):
+    folder, kind = tmp_path / "scenes", far(library)
+    for parts, message in [
+            (['<path value=".."/>', '<shape type="evil"/>'], "<path> is not supported"),
+            (['<include filename="sub/b.xml"/>'], "is the name of no plugin"),
+            (['<include filename="sub/d.xml"/>'], "<path> is not supported"),
+            ([f'<default name="k" value="{kind}"/><default name="k" value="sphere"/><shape type="$k"/>'], "of no plugin"),
+            ([f'<default name="a" value="{kind}"/><default name="b" value="$a"/><shape type="$b"/>'], "of no plugin"),
+            ([f'<default name="k" value="{kind[:-1]}"/><shape type="$k{kind[-1]}"/>'], "of no plugin")]:
+        scene(folder / "sub" / "c.xml", f'<shape type="{kind}"/>')
+        scene(folder / "c.xml", '<shape type="sphere"/>')
+        (folder / "sub" / "b.xml").write_text('<scene version="3.0.0"><include filename="c.xml"/></scene>')
+        (folder / "sub" / "d.xml").write_text('<scene version="3.0.0"><path value="../.."/></scene>')
+        with pytest.raises(SceneError, match=message):
+            load(scene(folder / "scene.xml", *parts))
     assert not (tmp_path / "RAN").exists()
 
 

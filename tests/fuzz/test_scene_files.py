@@ -156,9 +156,13 @@ SENSOR, SKY, BALL = '<sensor type="perspective"/>', '<emitter type="constant"/>'
     pytest.param("<bsdf type=\"twosided\">" * 20000 + "</bsdf>" * 20000, "deep; at most 100", id="too deep"),
     pytest.param(BALL.replace("sphere", "ply").replace("/>", '><string name="filename" value="/dev/zero"/></shape>'),
                  "/dev/zero is no file", id="a device that never ends"),
+    pytest.param('<bsdf type="diffuse"><spectrum name="reflectance" filename="/dev/zero"/></bsdf>', "/dev/zero is no file",
+                 id="so for a spectrum"),
     pytest.param(BALL.replace("sphere", "ply").replace("/>", '><string name="filename" value="near.ply"/></shape>'),
                  "names vertex 4 of 4", id="a face with a vertex that is not there"),
     pytest.param('<bsdf type="twosided" id="a"><ref id="a"/></bsdf>', "circular reference", id="a reference to itself"),
+    pytest.param('<default name="a0" value="x"/>' + "".join(f'<default name="a{i + 1}" value="$a{i}$a{i}"/>' for i in range(40)),
+                 "parameter 'a13' has 8192 characters, at most 4096", id="a value that grows without bounds"),
     pytest.param('<include filename="scene.xml"/>', "recursion", id="a file that includes itself"),
     pytest.param('<shape type="../sphere"/>', "is the name of no plugin", id="a plugin that is a path"),
 ])

@@ -186,7 +186,7 @@ def test_digest_follows_what_determines_the_image(tmp_path: Path):
     assert door != scenes.digest("door_ajar", {"gap": 0.08})
     assert door != scenes.digest("cornell_box")
 
-    mesh = '<shape type="ply"><string name="filename" value="$mesh"/></shape><default name="mesh" value="a.ply"/>'
+    mesh = '<default name="mesh" value="a.ply"/><shape type="ply"><string name="filename" value="$mesh"/></shape>'
     (tmp_path / "a.ply").write_text("12")
     file = xml(tmp_path, mesh)
     first = scenes.digest(file)
@@ -200,6 +200,42 @@ def test_digest_follows_what_determines_the_image(tmp_path: Path):
     (elsewhere / "a.ply").write_text("12")
     assert first == scenes.digest(xml(elsewhere, mesh))
     assert first != scenes.digest(xml(tmp_path, mesh, SHAPE))
+
+
+def test_digest_follows_the_files_that_mitsuba_finds(tmp_path: Path):
+    """Of spectra and images of one name in three folders: as Mitsuba's radiance changes, so does the digest, and only then."""
+    radiance = '<spectrum name="radiance" filename="$lamp"/>'
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+    parts = {"sub/a.xml": '<default name="lamp" value="late"/><include filename="b.xml"/>',
+             "sub/b.xml": f'<include filename="deep/c.xml"/>{sky}',
+             "sub/deep/c.xml": f'<shape type="sphere"><emitter type="area">{radiance}</emitter></shape>'}
+    folders = [tmp_path, tmp_path / "sub", tmp_path / "sub" / "deep"]
+    for folder in folders:
+        folder.mkdir(exist_ok=True)
+        (folder / "gold.spd").write_text("400 1\n700 1\n")
+        mi.Bitmap(np.ones((2, 4, 3), np.float32)).write(str(folder / "sky.exr"))
+    for name, part in parts.items():
+        (tmp_path / name).write_text(f'<scene version="3.0.0">{part}</scene>')
+    file = xml(tmp_path, '<default name="la" value="x"/><default name="lamp" value="gold.spd"/>', SENSOR,
+               '<include filename="sub/a.xml"/>')
+
+    def seen() -> tuple[list[float], str]:
+        scene = load(file)
+        lamp, sky = mi.traverse(scene.shapes()[0].emitter()), mi.traverse(scene.environment())
+        return [float(np.mean(lamp["radiance.value"].numpy())), float(np.mean(sky["data"].numpy()))], scenes.digest(file)
+
+    values, digest = seen()
+    changed = []
+    for folder in folders:
+        for name in ("gold.spd", "sky.exr"):
+            if name == "gold.spd":
+                (folder / name).write_text("400 3\n700 3\n")
+            else:
+                mi.Bitmap(np.full((2, 4, 3), 2, np.float32)).write(str(folder / name))
+            (before, old), (values, digest) = (values, digest), seen()
+            assert (before != values) == (old != digest)
+            changed.append(before != values)
+    assert changed == [False, True, True, False, False, False], values
 
 
 def test_the_registry_needs_no_mitsuba():
