@@ -42,6 +42,12 @@ def names() -> list[str]:
     return sorted({*BUILT_IN, *(e.name for e in importlib.metadata.entry_points(group=ENTRY_POINTS))})
 
 
+def file_of(name: str) -> tuple[Path, str] | None:
+    """The file and the class of ``path/to/file.py:ClassName``, whose code is run; None: any other name."""
+    file, _, attribute = name.rpartition(":")
+    return (Path(file), attribute) if file.endswith(".py") else None
+
+
 def find(name: str) -> Any:
     """The class behind a registered name or behind ``path/to/file.py:ClassName`` (which runs that file).
 
@@ -56,9 +62,8 @@ def find(name: str) -> Any:
             return entry.load()
         except Exception as error:      # other people's code
             raise RepresentationError(f"representation '{name}', entry point {entry.value}, {_reason(error)}") from error
-    if ".py:" in name:
-        file, _, attribute = name.rpartition(":")
-        return _from_file(Path(file), attribute)
+    if (found := file_of(name)) is not None:
+        return _from_file(*found)
     raise RepresentationError(f"unknown representation '{name}'; known: {', '.join(names())}, or path/to/file.py:ClassName")
 
 
@@ -68,20 +73,26 @@ def create(type: str, **parameters: Any) -> Any:
     The first argument is named as in a TOML, so that ``create(**{"type": "jensen"})`` works too.
 
     Raises:
-        RepresentationError: unknown name; unknown, missing or invalid hyper-parameter.
+        RepresentationError: unknown name; unknown, missing or invalid hyper-parameter; code of others that fails.
     """
     cls = find(type)
-    known = inspect.signature(cls).parameters
-    for key, value in parameters.items():
-        if key not in known:
-            raise RepresentationError(f"representation '{type}' has no parameter '{key}'; known: {', '.join(known) or 'none'}")
-        allowed = wrong_type(value, known[key].default)
-        if allowed:
-            raise RepresentationError(f"representation '{type}': {key} = {value!r}: must be {allowed}")
     try:
+        known = inspect.signature(cls).parameters
+        for key, value in parameters.items():
+            if key not in known:
+                raise RepresentationError(f"representation '{type}' has no parameter '{key}'; "
+                                          f"known: {', '.join(known) or 'none'}")
+            if (allowed := wrong_type(value, known[key].default)) is not None:
+                raise RepresentationError(f"representation '{type}': {key} = {value!r}: must be {allowed}")
         return cls(**parameters)
+    except RepresentationError:
+        raise
     except (TypeError, ValueError) as error:
         raise RepresentationError(f"representation '{type}': {error}") from error
+    except Exception as error:          # other people's code
+        if type in BUILT_IN:
+            raise
+        raise RepresentationError(f"representation '{type}' {_reason(error)}") from error
 
 
 def wrong_type(value: Any, default: Any) -> str | None:
@@ -107,7 +118,7 @@ def _from_file(file: Path, attribute: str) -> type:
         raise RepresentationError(f"representation file {file}: there is no such file")
     module_name = f"representation_{file.stem}"
     spec = importlib.util.spec_from_file_location(module_name, file)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None and spec.loader is not None         # by the suffix, see `file_of`
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module           # dataclasses look their module up by name
     try:

@@ -415,11 +415,9 @@ class Experiment(Table):
         for method in self.method:
             table, training = {"name": method.name}, self.training_of(method)
             if training is not None:
-                kind = method.representation_name or ""
-                file, separator, attribute = kind.rpartition(":")
                 table["representation"] = _representation_defaults(method)
-                if separator:
-                    table["representation"]["type"] = f"{path(file)}:{attribute}"
+                if (found := representations.file_of(method.representation_name or "")) is not None:
+                    table["representation"]["type"] = f"{path(found[0])}:{found[1]}"
                 table["training"] = dataclasses.asdict(training)
             integrator = dataclasses.asdict(self.integrator_of(self.scene[0], method))
             table["integrator"] = {k: v for k, v in integrator.items() if k != "max_depth"}
@@ -476,5 +474,5 @@ def own_code() -> str:
 
 def _representation_code(method: Method) -> str | None:
     """The source behind ``FILE.py:Class``; a registered name stands for itself."""
-    kind = method.representation_name
-    return hashlib.sha256(Path(kind.rpartition(":")[0]).read_bytes()).hexdigest() if kind and ".py:" in kind else None
+    found = representations.file_of(method.representation_name or "")
+    return hashlib.sha256(found[0].read_bytes()).hexdigest() if found is not None else None

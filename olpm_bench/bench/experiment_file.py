@@ -105,9 +105,9 @@ def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Pat
 @functools.cache
 def announce(representation: str | None) -> None:
     """Say on the terminal, once, that code is run which is not ours: that of FILE.py:Class."""
-    file, _, _ = (representation or "").rpartition(":")
-    if file.endswith(".py") and Path(file).is_file():
-        print(f"olpm-bench: runs the code of {file}", file=sys.stderr)
+    found = representations.file_of(representation or "")
+    if found is not None and found[0].is_file():
+        print(f"olpm-bench: runs the code of {found[0]}", file=sys.stderr)
 
 
 def _without_paths(data: dict[str, Any], folder: Path, source: str) -> dict[str, Any]:
@@ -132,9 +132,8 @@ def _without_paths(data: dict[str, Any], folder: Path, source: str) -> dict[str,
     for method in _tables(data.get("method")):
         representation = method.get("representation")
         kind = representation.get("type") if isinstance(representation, dict) else None
-        if isinstance(representation, dict) and isinstance(kind, str) and ".py:" in kind:
-            file, _, attribute = kind.rpartition(":")
-            representation["type"] = f"{absolute(file)}:{attribute}"
+        if isinstance(representation, dict) and isinstance(kind, str) and (found := representations.file_of(kind)) is not None:
+            representation["type"] = f"{absolute(str(found[0]))}:{found[1]}"
     return data
 
 

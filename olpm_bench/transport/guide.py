@@ -227,7 +227,7 @@ class Guide:
                                                    meta["particles"])
             if representation is not None and kind != representation:
                 raise InputError(f"{path} holds a guide of type '{kind}', not '{representation}'")
-            if representation is None and ".py:" in kind:
+            if representation is None and representations.file_of(kind) is not None:
                 raise InputError(f"{path} holds a guide of type '{kind}', whose code is run only if Guide.load is told this type")
             if not ((fraction is None or 0 < fraction <= 1) and isinstance(parallax, bool) and isinstance(particles, int)):
                 raise ValueError("meta")

@@ -13,10 +13,12 @@ import pytest
 import tomli_w
 from typer.testing import CliRunner
 
+from olpm_bench.bench import experiment_file
 from olpm_bench.cli import app
 from olpm_bench.scenes import SceneError
 from olpm_bench.scenes.load import load
 from olpm_bench.transport.guide import FORMAT
+from olpm_bench.transport.settings import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 WATCH = """
@@ -63,7 +65,7 @@ def experiment(folder: Path, kind: str, text: str = "") -> Path:
     data = {"title": f"T {text}", "description": text, "budget": {"spp": 1},
             "scene": [{"name": "cornell_box", "width": 4, "height": 4, "reference": "none"}],
             "method": [{"name": f"M {text}"}, {"name": "N", "representation": {"type": kind}}]}
-    file = folder / f"{kind.partition('.')[0]}.toml"
+    file = folder / f"{Path(kind).name.partition('.')[0]}.toml"
     file.write_text(tomli_w.dumps(data))
     return file
 
@@ -139,6 +141,17 @@ def test_a_library_is_not_loaded_by_way_of_a_path_an_include_or_a_parameter(tmp_
         (folder / "sub" / "d.xml").write_text('<scene version="3.0.0"><path value="../.."/></scene>')
         with pytest.raises(SceneError, match=message):
             load(scene(folder / "scene.xml", *parts))
+    assert not (tmp_path / "RAN").exists()
+
+
+def test_a_library_is_not_loaded_as_a_representation(tmp_path, library):
+    """Python would load it by its suffix; the name holds that of a file of Python."""
+    (tmp_path / "a.py:").mkdir()
+    shutil.copy(library, tmp_path / "a.py:" / "evil.so")
+    (tmp_path / "a.py:b").write_text("class Mine: pass")
+    for kind in ("a.py:/evil.so:Mine", f"{tmp_path}/a.py:/evil.so:Mine", "a.py:b:Mine", "plugins/evil.so:Mine"):
+        with pytest.raises(InputError, match="unknown representation"):
+            experiment_file.load(experiment(tmp_path, kind))
     assert not (tmp_path / "RAN").exists()
 
 

@@ -82,6 +82,24 @@ def test_from_file_that_cannot_be_run(tmp_path: Path, code: str, message: str) -
     assert "\n" not in str(error.value) and "representation_broken_file" not in sys.modules
 
 
+@pytest.mark.parametrize(("code", "message"), [
+    ("class Tilted:\n    def __init__(self, tilt=0.5): {}['tilt']", "cannot be loaded: KeyError: 'tilt'"),
+    ("class Tilted:\n    def __init__(self, tilt=0.5): assert tilt < 0.1, 'steep'", "cannot be loaded: AssertionError: steep"),
+    ("class Tilted(dict):\n    pass", "no signature found"),
+    ("class Tilted:\n    def __init__(self, tilt=0.5): raise ValueError('steep')", ": steep")])
+def test_from_file_whose_class_cannot_be_made(tmp_path: Path, code: str, message: str) -> None:
+    (tmp_path / "tilted.py").write_text(code)
+    with pytest.raises(representations.RepresentationError, match=f"representation '.*tilted.py:Tilted'.*{message}"):
+        representations.create(f"{tmp_path / 'tilted.py'}:Tilted")
+
+
+def test_what_names_a_file_of_code() -> None:
+    assert representations.file_of("a/b.py:Mine") == (Path("a/b.py"), "Mine")
+    assert representations.file_of("C:\\a.py:Mine") == (Path("C:\\a.py"), "Mine")
+    for name in ("jensen", "", "a.py", "a.py:/evil.so:Mine", "a.py:b:Mine", "a.pyc:Mine", "a.so:Mine"):
+        assert representations.file_of(name) is None, name
+
+
 def test_entry_point_that_cannot_be_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     entry = importlib.metadata.EntryPoint("tilted", "no_such_module:Tilted", representations.ENTRY_POINTS)
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group, name=None: [entry])
