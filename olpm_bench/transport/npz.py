@@ -5,14 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
+from olpm_bench.transport import headroom
 from olpm_bench.transport.settings import InputError
+
+COPIES = 2              # of arrays that are read: NumPy's, and what is made of them
 
 
 def read(path: str | Path) -> dict[str, np.ndarray]:
     """The arrays of an ``.npz`` file; none of them can hold objects, and so no code.
 
     Raises:
-        InputError: it is no such file, or not a whole one.
+        InputError: it is no such file, or not a whole one, or its arrays take more memory than is free.
         OSError: it can't be opened.
     """
     with open(path, "rb") as stream:
@@ -20,7 +23,11 @@ def read(path: str | Path) -> dict[str, np.ndarray]:
             archive = np.load(stream, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("it holds a single array")
+            unpacked = sum(array.file_size for array in archive.zip.infolist())
+            headroom.require(COPIES * unpacked, f"{path}: its arrays", "it can only be read where there is more")
             return dict(archive)
+        except InputError:
+            raise
         except Exception as error:          # NumPy, zipfile and zlib between them raise a dozen types
             raise InputError(f"{path}: not a whole .npz file: {str(error) or type(error).__name__}") from error
 

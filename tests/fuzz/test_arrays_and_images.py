@@ -15,9 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mutations import NUMBERS, examples, mutated_bytes, tables
 
+from olpm_bench.bench import fit
 from olpm_bench.bench.exr import write_exr
+from olpm_bench.transport import headroom
 from olpm_bench.transport.cache import SPLIT, RecordCache
 from olpm_bench.transport.guide import Guide
+from olpm_bench.transport.settings import InputError
 from representations.interface import ParticleBatch
 
 
@@ -172,3 +175,13 @@ def test_archives_that_are_larger_than_any_memory_or_locked(process, tmp_path):
         locked = stream.getvalue().replace(b"PK\x01\x02\x14\x03\x14\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01")
         assert judge(process, tmp_path, kind, locked) == "refused"
         assert judge(process, tmp_path, kind, header) == "refused"
+
+
+def test_archives_that_would_fill_the_memory_when_unpacked(tmp_path, monkeypatch):
+    file = tmp_path / "zeros.npz"
+    np.savez_compressed(file, wo=np.zeros((10**6, 3), np.float32), weight=np.zeros(10**6, np.float32))
+    assert file.stat().st_size < 10**5
+    monkeypatch.setattr(headroom, "free", lambda: 3e7)
+    for read in (Guide.load, lambda path: fit._load(path, "wo", "weight")):
+        with pytest.raises(InputError, match=r"zeros\.npz: its arrays take about 0\.032 GB, and 0\.03 GB are free"):
+            read(file)
