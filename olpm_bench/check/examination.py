@@ -10,7 +10,7 @@ from rich.console import Console
 from scipy import stats
 
 from olpm_bench.bench.files import slug
-from olpm_bench.bench.progress import Bar
+from olpm_bench.bench.progress import Bar, is_interrupt
 from olpm_bench.check import suite
 from olpm_bench.check.suite import LEVEL, Check, Outcome, Subject
 from olpm_bench.report import verdicts
@@ -86,7 +86,9 @@ def _draw(outcome: Outcome, subject: Subject, folder: Path) -> Path | None:
         return None
     try:
         panels = verdict.picture()
-    except Exception:           # other people's code, which has failed before
+    except Exception as error:          # other people's code, which has failed before
+        if is_interrupt(error):
+            raise
         return None
     path = folder / slug(Path(subject.name.replace(":", "-")).name) / f"{outcome.check.name}.png"
     verdicts.picture(panels, f"{subject.name}, {outcome.check.name}: {verdict.worst}", path)

@@ -14,7 +14,7 @@ from olpm_bench.check.particles import CONDITIONS, many, nothing, uniform_direct
 from olpm_bench.check.picture import CELL, over_disk
 from olpm_bench.check.population import population
 from olpm_bench.check.proposal import Proposals
-from olpm_bench.check.verdict import PValues, combined, sidak
+from olpm_bench.check.verdict import PValues, Verdict, combined, sidak
 from olpm_bench.cli import app
 
 MUTANTS = Path(__file__).parents[1] / "representations/mutants.py"
@@ -114,6 +114,19 @@ def test_a_campaign_counts_alarms(tmp_path: Path) -> None:
     assert result.exit_code == 0 and "0 of 3 runs raised an alarm" in result.stdout and "seed 7: passed" in result.stdout
     result = call(f"{MUTANTS}:InPlace", "--only", "purity", "--repeat", 2, "--json", "--pictures", tmp_path)
     assert result.exit_code == 1 and json.loads(result.stdout)["alarms"] == 2
+
+
+def test_an_interrupt_while_a_failure_is_drawn_is_none_of_other_peoples_errors(tmp_path: Path, monkeypatch) -> None:
+    def interrupted(*_: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise RuntimeError("dr.while_loop(): encountered an exception") from error
+
+    failure = Verdict(False, "wrong", None, None, "wrong", picture=interrupted)
+    monkeypatch.setattr(suite, "run", lambda subject, checks: iter([suite.Outcome(checks[0], failure, 0.0)]))
+    result = call("jensen", "--only", "memory", "--pictures", tmp_path)
+    assert result.exit_code == 130 and "interrupted" in result.stderr
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
