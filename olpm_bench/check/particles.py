@@ -10,7 +10,6 @@ from representations.interface import ParticleBatch
 
 Particles = tuple[np.ndarray, np.ndarray]       # of one record in one batch: wo [n, 3], weight [n]
 BATCHES = 3
-COPIES = 3              # records in each condition, with particles of their own
 MILLION = 1_000_000
 EDGE = 1e-4             # elevation z of grazing particles
 
