@@ -173,10 +173,11 @@ def test_scenes_that_crashed_or_hung(process, folder, part, words):
     assert words in answer.get("refused", ""), answer
 
 
-def test_what_kills_mitsuba_kills_another_process(tmp_path):
+@pytest.mark.parametrize("command", ["render {} --method unguided --spp 1 --out a.exr", "perf --scene {}"])
+def test_what_kills_mitsuba_kills_another_process(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
     scene = tmp_path / "scene.xml"
     scene.write_text(f'<scene version="3.0.0">{SENSOR}{SKY}{far(tmp_path)}</scene>')
-    command = ["render", str(scene), "--method", "unguided", "--spp", "1", "--out", str(tmp_path / "a.exr")]
-    result = CliRunner().invoke(app, command)
+    result = CliRunner().invoke(app, command.format(scene).split())
     assert result.exit_code == 2 and f"scene file {scene}: Mitsuba crashes when it loads it (SIG" in result.stderr
     assert len(result.stderr.splitlines()) == 1 and not (tmp_path / "a.exr").exists()
