@@ -19,7 +19,7 @@ from olpm_bench.bench import fit
 from olpm_bench.bench.exr import write_exr
 from olpm_bench.transport import headroom
 from olpm_bench.transport.cache import SPLIT, RecordCache
-from olpm_bench.transport.guide import Guide
+from olpm_bench.transport.guide import MIN_PARTICLES, Guide
 from olpm_bench.transport.settings import InputError
 from representations.interface import ParticleBatch
 
@@ -30,18 +30,26 @@ def process():
         yield process
 
 
+GUIDES = {"jensen": {"type": "jensen", "resolution": 2}, "hey": {"type": "hey", "cones": 4},
+          "gaussian_mixture": {"type": "gaussian_mixture", "components": 2}}        # all but the first with parallax
+
+
 @pytest.fixture(scope="module")
 def valid(tmp_path_factory) -> dict[str, bytes]:
-    """A small guide with split cells, directions, and an image."""
+    """Small guides with split cells and records that guide, directions, and an image."""
     folder = tmp_path_factory.mktemp("valid")
-    guide = Guide(RecordCache(mi.ScalarBoundingBox3f(-1, 1), 0.2), {"type": "jensen", "resolution": 2}, 0.5)
     rng = np.random.default_rng(0)
-    p = rng.uniform(-1, 1, (3, 200)).astype(np.float32)
-    guide.grow(mi.Point3f(p), dr.normalize(mi.Normal3f(rng.normal(size=(3, 200)).astype(np.float32))), mi.Bool(True), 0)
-    n = guide.records
-    batch = ParticleBatch.from_arrays(mi.Vector3f(0, 0.6, 0.8), dr.ones(mi.Float, n), dr.arange(mi.UInt32, n), n)
-    guide.learn_particles(batch, 0)
-    guide.save(folder / "guide.npz")
+    p, n = (rng.normal(size=(3, 200)).astype(np.float32) for _ in range(2))
+    for name, specification in GUIDES.items():
+        guide = Guide(RecordCache(mi.ScalarBoundingBox3f(-1, 1), 0.2), specification, 0.5, parallax=name != "jensen")
+        guide.grow(mi.Point3f(np.tanh(p)), dr.normalize(mi.Normal3f(n)), mi.Bool(True), 0)
+        m = guide.records * MIN_PARTICLES
+        wo, at = rng.uniform(0.1, 1, (3, m)).astype(np.float32), rng.uniform(-0.1, 0.1, (3, m)).astype(np.float32)
+        guide.learn_particles(ParticleBatch.from_arrays(
+            dr.normalize(mi.Vector3f(wo)), dr.ones(mi.Float, m), dr.arange(mi.UInt32, m) // MIN_PARTICLES, guide.records,
+            dr.ones(mi.Float, m) if guide.parallax else None, mi.Vector3f(at) if guide.parallax else None), 0)
+        assert guide.trained == 1
+        guide.save(folder / f"{name}.npz")
     wo = rng.normal(size=(20, 3)) * (1, 1, 0) + (0, 0, 3)
     np.savez(folder / "directions.npz", wo=wo / np.linalg.norm(wo, axis=1, keepdims=True), weight=np.ones(20), pdf=np.ones(20))
     write_exr(folder / "image.exr", {"mean": rng.uniform(size=(6, 8, 3)).astype(np.float32), "count": np.ones((6, 8))}, {"a": 1})
@@ -105,16 +113,16 @@ def changed_arrays(draw: st.DrawFn, valid: dict[str, np.ndarray]) -> dict[str, n
 
 
 @examples(0.2)
-@given(data=st.data())
-def test_guides_whose_arrays_are_broken(process, valid, tmp_path_factory, data):
-    arrays = data.draw(changed_arrays(arrays_of(valid["guide"])))
+@given(data=st.data(), name=st.sampled_from(list(GUIDES)))
+def test_guides_whose_arrays_are_broken(process, valid, tmp_path_factory, data, name):
+    arrays = data.draw(changed_arrays(arrays_of(valid[name])))
     judge(process, tmp_path_factory.getbasetemp(), "guide", packed(arrays))
 
 
 @examples(0.1)
-@given(data=st.data(), kind=st.sampled_from(["guide", "directions"]))
-def test_archives_whose_bytes_are_broken(process, valid, tmp_path_factory, data, kind):
-    judge(process, tmp_path_factory.getbasetemp(), kind, data.draw(mutated_bytes(valid[kind], dictionary=(b"PK\x03\x04",))))
+@given(data=st.data(), name=st.sampled_from([*GUIDES, "directions"]))
+def test_archives_whose_bytes_are_broken(process, valid, tmp_path_factory, data, name):
+    judge(process, tmp_path_factory.getbasetemp(), name, data.draw(mutated_bytes(valid[name], dictionary=(b"PK\x03\x04",))))
 
 
 @examples(0.05)
@@ -131,9 +139,9 @@ def test_images_whose_bytes_are_broken(process, valid, tmp_path_factory, data):
 
 
 def test_what_is_whole_is_read(process, valid, tmp_path):
-    for kind, content in valid.items():
-        assert judge(process, tmp_path, kind, content) == "ok"
-    assert judge(process, tmp_path, "guide", packed(arrays_of(valid["guide"]))) == "ok"
+    for name, content in valid.items():
+        assert judge(process, tmp_path, name, content) == "ok"
+    assert judge(process, tmp_path, "guide", packed(arrays_of(valid["jensen"]))) == "ok"
 
 
 def table(arrays: dict[str, np.ndarray], entry: int) -> dict[str, np.ndarray]:
@@ -160,7 +168,7 @@ def table(arrays: dict[str, np.ndarray], entry: int) -> dict[str, np.ndarray]:
     pytest.param(lambda a: {"meta": np.array(str(a["meta"]).replace("resolution", "resolutions"))}, id="a parameter it has not"),
 ])
 def test_guides_that_would_be_read_out_of_bounds(process, valid, tmp_path, change):
-    arrays = arrays_of(valid["guide"])
+    arrays = arrays_of(valid["jensen"])
     assert judge(process, tmp_path, "guide", packed(arrays | change(arrays))) == "refused"
 
 
