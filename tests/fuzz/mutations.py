@@ -9,10 +9,12 @@ import os
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 EXAMPLES = int(os.environ.get("OLPM_BENCH_FUZZ", "300"))
+PATIENCE, EACH = 600.0, 10.0        # [s] that a test and each of its examples may take on a busy machine
 
 NUMBERS = [0, -1, 1, 2, 7, 2**31, 2**32, 2**63, -2**63, 10**30, 0.0, -0.0, 0.5, 1e-38, 1e-45, 1e38, 1e308, -1e308,
            float("nan"), float("inf"), float("-inf")]
@@ -26,11 +28,12 @@ values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=3) | st.di
                       max_leaves=6)
 
 
-def examples(share: float, **more: Any) -> Callable[..., Any]:
-    """Settings of a test that takes its share of all examples; the same ones each time unless it is a campaign."""
-    return settings(max_examples=max(1, round(share * EXAMPLES)), deadline=None, database=None,
-                    derandomize="OLPM_BENCH_FUZZ" not in os.environ, print_blob=True,
-                    suppress_health_check=list(HealthCheck), **more)
+def examples(share: float) -> Callable[..., Any]:
+    """A test that takes its share of all examples, and its time for them; the same ones each time unless it is a campaign."""
+    n = max(1, round(share * EXAMPLES))
+    same = settings(max_examples=n, deadline=None, database=None, derandomize="OLPM_BENCH_FUZZ" not in os.environ,
+                    print_blob=True, suppress_health_check=list(HealthCheck))
+    return lambda test: pytest.mark.timeout(PATIENCE + EACH * n)(same(test))
 
 
 def _places(value: Any) -> list[tuple[Any, Any]]:
