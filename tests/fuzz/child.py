@@ -1,15 +1,21 @@
-"""A process that reads what is not experiment files, so that neither a crash nor a hang ends the test.
+"""A process that reads files, so that neither a crash nor a hang ends the test.
 
     with child() as process:
         answer = process.ask("guide", "guide.npz")      # {"ok": true}, {"refused": "one line"}, {"traceback": ...}, {"died": -11}
+
+Whatever Python opens for writing, makes, renames or removes must be below `results` beside the file, or in a cache of libraries:
+else there is a traceback that tells.
 """
 from __future__ import annotations
 
+import os
 import resource
 import sys
 from pathlib import Path
+from typing import Any
 
 from olpm_bench.bench import probe
+from olpm_bench.transport.settings import InputError
 
 SECONDS = 400.0                 # without an answer a file hangs the process
 GIGABYTES = 8                   # address space of the process: what would fill the machine's memory fails at once
@@ -20,8 +26,63 @@ def child() -> probe.Process:
     return probe.Process([sys.executable, __file__], SECONDS)
 
 
+WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+PATHS = {"os.rename": 2, "os.link": 2, "os.symlink": 2, "os.mkdir": 1, "os.truncate": 1, "os.chmod": 1, "shutil.rmtree": 1}
+touched: list[str] = []         # what the file that is being read makes us write, make, rename or remove
+
+
+def note(event: str, arguments: tuple[Any, ...]) -> None:
+    """An audit hook."""
+    number = PATHS.get(event, 0)
+    if event == "open":
+        number = 1 if (arguments[2] or 0) & WRITING else 0
+    elif event in ("os.remove", "os.rmdir"):
+        number = 1 if arguments[1] == -1 else 0         # or it is below what rmtree was told
+    touched.extend(os.path.realpath(os.fsdecode(path)) for path in arguments[:number] if not isinstance(path, int))
+
+
+def strays(results: Path) -> list[str]:
+    """What was touched and is neither below the results nor in a cache of bytecode or of fonts."""
+    import matplotlib
+
+    own = [os.path.realpath(folder) for folder in (results, os.devnull, matplotlib.get_configdir(), matplotlib.get_cachedir())]
+    return [path for path in touched
+            if not any(Path(path).is_relative_to(folder) for folder in own) and "__pycache__" not in Path(path).parts]
+
+
 def read(kind: str, path: str) -> None:
-    """Do with a file what the commands do with it."""
+    """Do with a file what the commands do with it; `run` and `render` are these commands."""
+    touched.clear()
+    results = Path(path).with_name("results")
+    try:
+        if kind == "run":
+            command("run", path, "--results", results)
+        elif kind == "render":
+            size = "--width", 4, "--height", 4, "--spp", 1
+            command("render", path, "--method", "unguided", *size, "--out", results / "image.exr")
+        else:
+            load(kind, path)
+    finally:
+        assert not (found := strays(results)), found
+
+
+def command(*arguments: object) -> None:
+    """
+    Raises:
+        InputError: its exit code is that of a failure or of bad input.
+    """
+    from typer.main import get_command
+
+    from olpm_bench.cli import app
+
+    probe.check = lambda path, overrides: None          # this process is shield enough
+    code = get_command(app).main([str(argument) for argument in arguments], standalone_mode=False) or 0
+    assert code in (0, 1, 2), code
+    if code:
+        raise InputError(f"exit code {code}")
+
+
+def load(kind: str, path: str) -> None:
     import drjit as dr
     import mitsuba as mi
     import numpy as np
@@ -50,4 +111,5 @@ def read(kind: str, path: str) -> None:
 
 if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_AS, (GIGABYTES << 30, GIGABYTES << 30))
+    sys.addaudithook(note)
     probe.serve(read)

@@ -3,15 +3,17 @@ from __future__ import annotations
 
 import copy
 import io
+import shutil
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import pytest
 import tomli_w
+from child import child
 from hypothesis import example, given
 from hypothesis import strategies as st
-from mutations import examples, mutated_bytes, tables
+from mutations import examples, mutated_bytes, names, tables
 from typer.main import get_command
 
 from olpm_bench.bench import experiment_file
@@ -19,6 +21,8 @@ from olpm_bench.bench.results import Results
 from olpm_bench.cli import app
 
 XML = '<scene version="3.0.0"><default name="resx" value="4"/></scene>'
+SEEN = """<scene version="3.0.0"><emitter type="constant"/><shape type="sphere"/><sensor type="perspective">
+<transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform></sensor></scene>"""
 VALID = {
     "title": "Test", "seeds": 2, "description": "two", "baseline": "Path tracing",
     "budget": {"spp": 8, "checkpoints": 2},
@@ -45,10 +49,17 @@ COMMAND = get_command(app)          # made once, which takes longer than to read
 def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("fuzz")
     (folder / "room.xml").write_text(XML)
+    (folder / "seen.xml").write_text(SEEN)
     (folder / "folder").mkdir()
     (folder / "loop").symlink_to("loop")
     (folder / "mine.py").write_text("class Mine:\n    def __init__(self, width=0.2): self.width = width\n")
     return folder
+
+
+@pytest.fixture(scope="module")
+def process():
+    with child() as process:
+        yield process
 
 
 def check(folder: Path, content: bytes, *options: str, name: str = "test.toml") -> int:
@@ -65,6 +76,31 @@ def check(folder: Path, content: bytes, *options: str, name: str = "test.toml") 
         assert len(lines[0]) < 2000 and lines[0].isprintable(), lines[0]
     assert set(folder.rglob("*")) == before
     return code
+
+
+@example(scene="../../up", method="/etc/passwd", stem="..x").via("names that are paths")
+@examples(0.01)
+@given(scene=names, method=names, stem=st.sampled_from(["test", "a b", "-", "nul", "é" * 60, "a.b", "[x]"]))
+def test_what_is_run_writes_into_its_results_only(process, folder, scene, method, stem):
+    data = {"title": method, "budget": {"spp": 1, "checkpoints": 1}, "integrator": {"max_depth": 3},
+            "scene": [{"name": scene, "file": "seen.xml", "width": 4, "height": 4, "reference": "none"}],
+            "method": [{"name": "Path tracing"}, {"name": method, "integrator": {"roulette": "none"}}]}
+    code = check(folder, tomli_w.dumps(data).encode(), name=f"{stem}.toml")
+    answer = process.ask("run", str(folder / f"{stem}.toml"))
+    assert ("refused" if code else "ok") in answer, answer
+    assert code or {path.name for path in (folder / "results").iterdir()} == {stem}
+    shutil.rmtree(folder / "results", ignore_errors=True)
+
+
+@pytest.mark.parametrize("how", ["open('stray', 'w')", "os.open('stray', os.O_CREAT)", "os.mkdir('stray')", "os.remove('stray')",
+                                 "os.rename('results', 'stray')", "shutil.rmtree('stray')"])
+def test_what_is_touched_elsewhere_is_noticed(process, tmp_path, how):
+    (tmp_path / "mine.py").write_text("import os, shutil\nclass Mine:\n    def __init__(self):\n"
+                                      f"        os.chdir({str(tmp_path)!r})\n        try: {how}\n        finally: 1 / 0")
+    data = {"title": "T", "budget": {"spp": 1}, "scene": [{"name": "cornell_box", "width": 4, "height": 4}],
+            "method": [{"name": "Mine", "representation": {"type": "mine.py:Mine"}}]}
+    (tmp_path / "test.toml").write_text(tomli_w.dumps(data))
+    assert str(tmp_path / "stray") in process.ask("run", str(tmp_path / "test.toml")).get("traceback", "")
 
 
 def stays_inside(folder: Path, name: str = "test.toml") -> None:

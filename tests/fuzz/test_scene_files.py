@@ -104,13 +104,16 @@ def elements(draw: st.DrawFn, valid: str) -> bytes:
     return ElementTree.tostring(root, "utf-8")
 
 
-def judge(process, folder: Path, xml: bytes) -> str:
+def judge(process, folder: Path, xml: bytes, kind: str = "scene") -> str:
     """The scene read by a process as shields the commands, which may be killed by Mitsuba; returns what came of it."""
+    def files() -> list[tuple[Path, int]]:
+        return sorted((p, p.stat().st_mtime_ns) for p in folder.rglob("*") if "results" not in p.parts)
+
     (folder / "scene.xml").write_bytes(xml)
-    before = sorted((p, p.stat().st_mtime_ns) for p in folder.rglob("*"))
-    answer = process.ask("scene", str(folder / "scene.xml"))
+    before = files()
+    answer = process.ask(kind, str(folder / "scene.xml"))
     assert {"ok", "refused", "died"} & answer.keys(), answer
-    assert sorted((p, p.stat().st_mtime_ns) for p in folder.rglob("*")) == before
+    assert files() == before
     return next(iter(answer))
 
 
@@ -120,6 +123,13 @@ def judge(process, folder: Path, xml: bytes) -> str:
 @given(xml=elements(XML))
 def test_elements_that_are_broken(process, folder, xml):
     judge(process, folder, xml)
+
+
+@examples(0.01)
+@given(xml=elements(XML))
+def test_elements_that_are_broken_and_rendered(process, folder, xml):
+    (folder / "results").mkdir(exist_ok=True)
+    judge(process, folder, xml, "render")
 
 
 @examples(0.05)
@@ -140,7 +150,9 @@ def test_meshes_and_images_that_are_broken(process, folder, data, name):
 
 
 def test_the_whole_scene_is_read(process, folder):
-    assert judge(process, folder, XML.encode()) == "ok"
+    (folder / "results").mkdir(exist_ok=True)
+    assert judge(process, folder, XML.encode()) == judge(process, folder, XML.encode(), "render") == "ok"
+    assert (folder / "results" / "image.exr").is_file()
 
 
 def far(folder: Path) -> str:
