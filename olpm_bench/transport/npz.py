@@ -1,6 +1,7 @@
 """Arrays from files that may be broken, or made by somebody else: either they are what they have to be, or there is one error."""
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ def read(path: str | Path) -> dict[str, np.ndarray]:
             archive = np.load(stream, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ValueError("it holds a single array")
-            unpacked = sum(array.file_size for array in archive.zip.infolist())
+            unpacked = sum(array.file_size for array in zipfile.ZipFile(stream).infolist())
             headroom.require(COPIES * unpacked, f"{path}: its arrays", "it can only be read where there is more")
             return dict(archive)
         except InputError:
