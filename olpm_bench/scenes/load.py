@@ -112,7 +112,7 @@ def _from_file(path: Path, parameters: dict[str, Any], width: int | None, height
     mi.set_file_resolver(beside)  # type: ignore[operator]
     try:
         state = parser.parse_file(config, str(path), **values)
-        _check_folders(Path(str(folder)) for folder in list(beside)[:-len(resolver)])
+        _check_folders(Path(str(folder)) for folder in list(beside)[:len(beside) - len(resolver)])
         _check_types(path, state)
         parser.transform_upgrade(config, state)
         parser.transform_resolve_references(config, state)
