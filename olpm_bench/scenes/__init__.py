@@ -29,7 +29,7 @@ import numpy as np
 from olpm_bench.transport.settings import InputError
 
 LARGEST = 1e6           # parameter of an embedded scene
-MOST_INCLUDES = 15      # inside each other, as in Mitsuba
+MOST_INCLUDES = 14      # inside each other, as in Mitsuba
 LONGEST = 4096          # characters of a scene file's parameter, which can be made of others that are made of others
 EMBEDDED = ("door_ajar", "living_room", "classroom", "cornell_box")
 
@@ -164,8 +164,8 @@ def read(path: Path, overrides: dict[str, str]) -> tuple[dict[Path, SceneFile], 
     def add(file: Path, folders: tuple[Path, ...]) -> None:
         if file in found:
             return
-        if len(folders) > MOST_INCLUDES:
-            raise SceneError(f"scene file {path}: files include each other {MOST_INCLUDES} deep")
+        if len(folders) - 2 > MOST_INCLUDES:            # two are there from the beginning
+            raise SceneError(f"scene file {path}: files include each other more than {MOST_INCLUDES} deep")
         found[file] = SceneFile(read_xml(file), folders)
         for element in found[file].root.iter():
             for key, text in element.items():
@@ -221,9 +221,9 @@ def _file_content(path: Path, overrides: dict[str, str]) -> list[list[Any]]:
     files, _ = read(path, overrides)
     content: list[list[Any]] = [[f.name, _sha256(f)] for f in files]
     for name, file, must_be in named_files(path, files):
-        code = _sha256(file) if file is not None and file.is_file() else None
-        if must_be or ("." in name and code is not None):
-            content.append([name, code])
+        sha256 = _sha256(file) if file is not None and file.is_file() else None
+        if must_be or ("." in name and sha256 is not None):
+            content.append([name, sha256])
     return content
 
 

@@ -146,7 +146,7 @@ def _check_text(path: Path, files: dict[Path, SceneFile]) -> None:
 
 
 def _check_types(path: Path, state: Any) -> None:
-    """Refuse what would be run as a plugin's code: types are looked at when Mitsuba has parsed them, so that none looks other."""
+    """Refuse names by which Mitsuba would find code that is no plugin of its own: those that it has parsed itself."""
     for node in state.nodes:
         if re.search(r"[/\\.]", kind := node.props.plugin_name()):
             raise SceneError(f"scene file {path}: type {kind!r} is the name of no plugin")

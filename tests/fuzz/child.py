@@ -19,16 +19,15 @@ from olpm_bench.transport.settings import InputError
 
 SECONDS = 400.0                 # without an answer a file hangs the process
 GIGABYTES = 8                   # address space of the process: what would fill the machine's memory fails at once
+WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+# Audit event -> how many of its arguments are paths
+PATHS = {"os.rename": 2, "os.link": 2, "os.symlink": 2, "os.mkdir": 1, "os.truncate": 1, "os.chmod": 1, "shutil.rmtree": 1}
+touched: list[str] = []         # what the file that is being read makes us write, make, rename or remove
 
 
 def child() -> probe.Process:
     """Runs this file."""
     return probe.Process([sys.executable, __file__], SECONDS)
-
-
-WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-PATHS = {"os.rename": 2, "os.link": 2, "os.symlink": 2, "os.mkdir": 1, "os.truncate": 1, "os.chmod": 1, "shutil.rmtree": 1}
-touched: list[str] = []         # what the file that is being read makes us write, make, rename or remove
 
 
 def note(event: str, arguments: tuple[Any, ...]) -> None:
@@ -83,6 +82,7 @@ def command(*arguments: object) -> None:
 
 
 def load(kind: str, path: str) -> None:
+    """What the commands do with it first."""
     import drjit as dr
     import mitsuba as mi
     import numpy as np

@@ -88,6 +88,18 @@ def test_files_are_found_beside_the_scene_and_in_includes(tmp_path: Path):
     assert "\n" not in str(error.value)
 
 
+def test_includes_inside_each_other(tmp_path: Path):
+    """As deep as Mitsuba follows them, and no deeper."""
+    for i in range(scenes.MOST_INCLUDES + 1):
+        xml(tmp_path, f'<include filename="{i + 1}.xml"/>', name=f"{i}.xml")
+    xml(tmp_path, SENSOR, SHAPE, EMITTER, name=f"{scenes.MOST_INCLUDES + 1}.xml")
+    assert len(load(tmp_path / "1.xml").shapes()) == 1
+    with pytest.raises(SceneError, match=r"0\.xml: files include each other more than 14 deep"):
+        load(tmp_path / "0.xml")
+    with pytest.raises(RuntimeError, match="recursion depth"):
+        mi.load_file(str(tmp_path / "0.xml"))
+
+
 @pytest.mark.parametrize("name", BITTERLI)
 @pytest.mark.filterwarnings("ignore:.*only absorbs")
 def test_shared_scenes(name: str):
