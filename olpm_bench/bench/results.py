@@ -117,6 +117,14 @@ class Results:
     def write_text(self, name: str, text: str) -> None:
         write_text(self.folder / name, text)
 
+    def has_environment(self) -> bool:
+        """Whether there is an env.json that can be read."""
+        try:
+            read_json(self.folder / "env.json")
+        except ResultError:
+            return False
+        return True
+
     def cell_folder(self, scene: str, method: str, seed: int) -> Path:
         return self.folder / "cells" / slug(scene) / slug(method) / str(seed)
 

@@ -78,7 +78,6 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
     results, part = Results(root / experiment.stem), experiment.of_scenes(only)
     references(part, root)                                  # before hours of work, not after
     cells = shard.first(part.cells()) if together else shard.of(part.cells())
-    loaded = {spec.scene.name: load_scene(spec) for spec in {c.scene.name: c for c in cells}.values()}
     todo, problems = [], []
     for spec in cells:
         complete, why = is_complete(results, spec)
@@ -87,9 +86,11 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
         else:
             todo.append((spec, why))
     require_memory([spec for spec, _ in todo])
+    loaded = {name: load_scene(spec) for name, spec in {spec.scene.name: spec for spec, _ in todo}.items()}
     remove_unfinished(results.folder)
     results.write_text("experiment.toml", experiment.toml(results.folder))
-    results.write_json("env.json", environment.describe())
+    if todo or not results.has_environment():       # else it is that of where the cells were made
+        results.write_json("env.json", environment.describe())
 
     warm: dict[tuple[str, str], WarmUp] = {}
     failures = {str(spec): results.failure(spec.scene.name, spec.method.name, spec.seed) for spec, _ in todo}

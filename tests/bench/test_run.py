@@ -63,6 +63,25 @@ def test_a_rerun_skips_what_is_complete(experiment, root, monkeypatch):
     assert run.run(experiment, root) == [] and counted.calls == 0
 
 
+def test_env_json_is_of_where_cells_were_made_and_scenes_are_loaded_for_those_alone(experiment, root, monkeypatch):
+    path, scenes = root / "test" / "env.json", []
+    monkeypatch.setattr(run.environment, "describe", lambda: {"schema_version": 1, "cpu": cpu})
+    monkeypatch.setattr(run, "load_scene", lambda spec, load=run.load_scene: scenes.append(str(spec)) or load(spec))
+
+    def written() -> str:
+        assert run.run(experiment, root) == []
+        return json.loads(path.read_text())["cpu"]
+    cpu = "of a node"
+    assert written() == "of a node" and len(scenes) == 1
+    cpu = "of the login node"
+    assert written() == "of a node" and len(scenes) == 1
+    path.write_text("{")
+    assert written() == "of the login node" and len(scenes) == 1        # broken: better than none
+    cpu = "of another node"
+    (cells(experiment, root)[1].folder / "cell.json").unlink()
+    assert written() == "of another node" and len(scenes) == 2
+
+
 def test_changed_broken_and_missing_cells_are_redone(experiment, root, monkeypatch):
     run.run(experiment, root)
     done = cells(experiment, root)
