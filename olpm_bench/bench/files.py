@@ -1,14 +1,15 @@
 """Files that are whole or not there: written beside their place and renamed.  JSON without NaN, versions, digests."""
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
 import os
 import re
 import shutil
-import socket
 import tempfile
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,13 +82,22 @@ def check_writable(folder: Path) -> None:
         raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
+@functools.cache
+def here() -> dict[str, str]:
+    """Whose process numbers are this process's: `boot`, one run of one machine; `numbers`, its own ones, as a container has."""
+    try:
+        return {"boot": Path("/proc/sys/kernel/random/boot_id").read_text().strip(), "numbers": os.readlink("/proc/self/ns/pid")}
+    except OSError:             # not on Linux
+        return {"boot": f"{uuid.getnode():x}", "numbers": ""}
+
+
 def writer() -> str:
     """Who writes, in the names of unfinished files."""
-    return f"{socket.gethostname()}-{os.getpid()}"
+    return f"{digest(*(part.encode() for part in here().values()))}-{os.getpid()}"
 
 
 def remove_path(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)

@@ -13,11 +13,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from olpm_bench.bench.files import ResultError, clean_up, remove_path, writer
+from olpm_bench.bench.files import ResultError, clean_up, here, remove_path, writer
 
-LEASE = 1800.0          # [s] without a sign of life after which a lock counts as left behind
-SIGNING = 10.0          # [s] until a lock is signed, at most
+LEASE = 1800.0          # [s] without a sign of life after which a lock or an unfinished file counts as left behind
 BEAT = 30.0             # [s] between signs of life, at least
+MACHINE_ID = Path("/etc/machine-id")
+UNFINISHED = re.compile(r"\..+\.([0-9a-f]+)-(\d+)\.tmp(?:\.\w+)?")     # by `writer`
 
 
 class LockedError(ResultError):
@@ -70,7 +71,9 @@ def locked(folder: Path) -> Iterator[Alive]:
 
     try:
         for left in folder.glob(".*.tmp*"):
-            remove_path(left)
+            if not left.name.startswith(".lock."):      # others may be asking for the lock right now
+                remove_path(left)
+        remove_unfinished(folder)
         yield alive
     except OSError:
         check()                     # an unfinished file may have gone with the lock
@@ -87,16 +90,12 @@ def tidy(folder: Path) -> None:
 
 
 def _identity() -> dict[str, Any]:
-    """This process.  `boot` tells one run of a machine from another, `numbers` whose process numbers are meant (a container has
-    its own)."""
-    def read(read: Callable[[str], str], name: str) -> str:
-        try:
-            return read(name).strip()
-        except OSError:             # not on Linux
-            return ""
-    return {"pid": os.getpid(), "host": socket.gethostname(), "started": _started(os.getpid()),
-            "boot": read(lambda name: Path(name).read_text(), "/proc/sys/kernel/random/boot_id"),
-            "numbers": read(os.readlink, "/proc/self/ns/pid")}
+    """This process.  `machine` tells apart those of one name; it is empty where there is no telling."""
+    try:
+        machine = MACHINE_ID.read_text().strip()
+    except OSError:             # not on Linux, or in a container
+        machine = ""
+    return {"pid": os.getpid(), "started": _started(os.getpid()), "host": socket.gethostname(), "machine": machine, **here()}
 
 
 def _started(pid: int) -> float | None:
@@ -118,7 +117,7 @@ def _signed(owner: dict[str, Any]) -> bytes:
 
 
 def _read_lock(path: Path, alive: bool = False) -> dict[str, Any]:
-    """The owner of a lock, with or without the last sign of life; {} before it has signed.
+    """The owner of a lock, with or without the last sign of life; {} if it says nothing.
 
     Raises:
         FileNotFoundError: nobody's.
@@ -138,13 +137,18 @@ def _silence(owner: dict[str, Any], path: Path) -> float:
     """
     me = _identity()
     with suppress(KeyError, TypeError, ValueError):     # of another version
-        if owner["host"] == me["host"]:
-            if owner["boot"] != me["boot"]:
-                return math.inf                         # the machine was started again
+        if owner["boot"] == me["boot"]:
             if owner["numbers"] == me["numbers"] and _started(owner["pid"]) != owner["started"]:
                 return math.inf                         # also if another process has its number now
             return time.monotonic() - float(owner["alive"])
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".now.", suffix=".tmp") as now:
+        if me["machine"] and all(owner[name] == me[name] for name in ("machine", "host", "numbers")):
+            return math.inf                             # the machine was started again
+    return _age(path)
+
+
+def _age(path: Path) -> float:
+    """Seconds since a file was written, by the clock of its file system."""
+    with tempfile.TemporaryFile(dir=path.parent, prefix=".now.", suffix=".tmp") as now:
         return abs(os.fstat(now.fileno()).st_mtime - path.stat().st_mtime)      # set back, it may be in the future
 
 
@@ -160,41 +164,84 @@ def _acquire(path: Path) -> dict[str, Any]:
     """Create the lock; return its owner, this process."""
     me = _identity()
     for _ in range(3):
-        try:
-            handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
-        except FileExistsError:
-            try:
-                owner = _read_lock(path, alive=True)
-                silent = _silence(owner, path)
-            except FileNotFoundError:                   # released meanwhile
-                continue
-            if silent <= (LEASE if owner else SIGNING):
+        if _create(path, _signed(me)):
+            return me
+        with suppress(FileNotFoundError):               # released meanwhile, or another was faster
+            owner = _read_lock(path, alive=True)
+            silent = _silence(owner, path)
+            if silent <= LEASE:
                 who = f"process {owner['pid']} on {owner['host']}" if {"pid", "host"} <= owner.keys() else "somebody unknown"
                 raise LockedError(f"{path} is held by {who}, whose last sign of life was {silent:.0f} s ago; "
-                                  f"after {LEASE / 60:.0f} minutes without one it is taken over") from None
-            aside = path.with_name(f".lock.{writer()}.tmp")
-            try:
-                os.rename(path, aside)                  # one of those who try this succeeds
-            except FileNotFoundError:
-                continue
+                                  f"after {LEASE / 60:.0f} minutes without one it is taken over")
+            aside = _beside(path)
+            os.rename(path, aside)                      # one of those who try this succeeds
             if _read_lock(aside, alive=True) != owner:  # it lives, or another was faster: put back what was moved
                 with suppress(OSError):
-                    os.link(aside, path)
-            aside.unlink()
-            continue
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(_signed(me))
-        except BaseException:       # a full disk, Ctrl-C
-            path.unlink(missing_ok=True)
-            raise
-        return me
+                    _link(aside, path)
+            aside.unlink(missing_ok=True)
     raise LockedError(f"{path} is contended")
 
 
+def _beside(path: Path) -> Path:
+    return path.with_name(f".lock.{writer()}.tmp")
+
+
+def _create(path: Path, content: bytes) -> bool:
+    """Create a lock that is signed from the first moment on; False if there is one."""
+    beside, made = _beside(path), False
+    try:
+        beside.unlink(missing_ok=True)      # of who had our number: another name of its lock
+        beside.write_bytes(content)
+        _link(beside, path)
+        made = True
+        beside.unlink()
+    except BaseException as error:          # a full disk, Ctrl-C
+        for left in (beside, path) if made else (beside,):
+            with suppress(OSError):
+                clean_up(left.unlink)
+        if isinstance(error, FileExistsError):
+            return False
+        if isinstance(error, OSError):
+            error.filename, error.filename2 = str(path), None
+        raise
+    return True
+
+
+def _link(source: Path, path: Path) -> None:
+    """Give a file another name; where a file system has no hard links, a copy, which for a moment is empty.
+
+    Raises:
+        FileExistsError: the name is taken.
+    """
+    try:
+        os.link(source, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        with path.open("xb") as file:
+            try:
+                file.write(source.read_bytes())
+                file.flush()
+            except BaseException:           # a full disk, Ctrl-C
+                path.unlink(missing_ok=True)
+                raise
+
+
 def remove_unfinished(folder: Path) -> None:
-    """Remove the unfinished files in a folder whose writers were processes of this host and are gone."""
-    for left in folder.glob(f".*.{socket.gethostname()}-*.tmp*"):
-        pid = re.search(r"-(\d+)\.tmp[^-]*$", left.name)
-        if pid is not None and _started(int(pid[1])) is None:
-            remove_path(left)
+    """Remove the unfinished files in a folder whose writers are gone."""
+    for left in folder.glob(".*.tmp*"):
+        with suppress(FileNotFoundError):
+            if _is_left(left):
+                remove_path(left)
+
+
+def _is_left(path: Path) -> bool:
+    """Whether an unfinished file's writer has ended, or is silent for half an hour.
+
+    Raises:
+        FileNotFoundError: it is gone.
+    """
+    if (found := UNFINISHED.fullmatch(path.name)) is None:
+        return False                # not one of ours
+    who, pid = found.groups()
+    return (writer() == f"{who}-{os.getpid()}" and _started(int(pid)) is None) or _age(path) > LEASE

@@ -3,7 +3,7 @@
     python killed.py FOLDER AT COUNT ARGUMENTS...
 
 AT: the number of the event, from 1; 0: none.  COUNT: the file that gets the number of events.  An event is the opening of a file
-for writing, a new folder, a renaming, a removal; it is counted before it happens.
+for writing, by its name or its number, a new folder, a link, a renaming, a removal; it is counted before it happens.
 """
 import os
 import signal
@@ -16,10 +16,11 @@ below, at, seen = os.path.abspath(folder) + os.sep, int(at), 0
 
 def event(name: str, arguments: tuple) -> None:
     global seen
-    if name not in EVENTS or not isinstance(arguments[0], str | os.PathLike):
+    if name not in EVENTS or (name == "open" and not arguments[2] & (os.O_WRONLY | os.O_RDWR)):
         return
-    writes = name != "open" or arguments[2] & (os.O_WRONLY | os.O_RDWR)
-    if writes and os.path.abspath(arguments[0]).startswith(below):
+    file = arguments[0]
+    path = os.readlink(f"/proc/self/fd/{file}") if isinstance(file, int) else os.path.abspath(os.fsdecode(file))
+    if path.startswith(below):
         seen += 1
         if seen == at:
             os.kill(os.getpid(), signal.SIGKILL)

@@ -484,15 +484,25 @@ def test_a_torn_pass_never_enters_a_reference(monkeypatch):
 # ---------------------------------------------------------------- what is left of the dead
 
 def test_unfinished_files_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
+    """Those of another machine, or of a container with its own process numbers, when they are silent for half an hour."""
     dead = python("")
     dead.communicate()
-    host = os.uname().nodename
-    left = [f".experiment.toml.{host}-{dead.pid}.tmp.toml", f".gains.png.{host}-{dead.pid}.tmp.png"]
-    kept = [f".summary.json.{host}-{os.getpid()}.tmp.json", ".env.json.elsewhere-1.tmp.json", "notes.tmp"]
+    here, silent = files.writer().rpartition("-")[0], f".sheet.png.beef-{dead.pid}.tmp.png"
+    left = [f".experiment.toml.{here}-{dead.pid}.tmp.toml", f".gains.png.{here}-{dead.pid}.tmp.png", silent]
+    kept = [f".summary.json.{here}-{os.getpid()}.tmp.json", f".env.json.beef-{dead.pid}.tmp.json", "notes.tmp", ".notes.tmp"]
     for name in left + kept:
         (tmp_path / name).touch()
+    for name in (silent, ".notes.tmp"):
+        os.utime(tmp_path / name, (time.time() - 2 * lock.LEASE,) * 2)
     lock.remove_unfinished(tmp_path)
     assert files_in(tmp_path) == sorted(kept)
+
+
+def test_the_name_of_an_unfinished_file_tells_whose_process_number_it_holds(monkeypatch):
+    here, name = files.here(), files.writer()
+    for part in here:
+        monkeypatch.setattr(files, "here", lambda part=part: here | {part: "another"})
+        assert files.writer() != name and files.writer().endswith(f"-{os.getpid()}")
 
 
 def test_a_complete_cell_is_freed_from_who_was_killed_with_it(tmp_path):

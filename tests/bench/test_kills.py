@@ -1,6 +1,6 @@
 """Kill -9 at random moments of a run: the next goes on, and what it makes is what an undisturbed run makes, bit for bit.
 
-A campaign of `OLPM_KILLS` kills, 5 by default, in tests of 5 (-n 8, of pytest-xdist, runs 8 of them at a time):
+A campaign of `OLPM_KILLS` kills, 5 by default, in tests of 5 (`-n 8 --dist load`, of pytest-xdist, runs 8 of them at a time):
 
     OLPM_KILLS=50 pytest tests/bench/test_kills.py -m slow -rP
 
