@@ -1,8 +1,8 @@
 """Claims of an experiment, put to the test: is one method better than another by the factor that the file states?
 
-Seeds are paired.  The ratio of two errors is the geometric mean over seeds of the paired ratios, that of two variances
-is of all seeds together; a bootstrap over seeds bounds it from above.  A claim holds if that bound does not exceed
-what it states, and so never for a lack of data.  All claims must hold, which needs no correction for their number.
+Seeds are paired.  The ratio of two errors is the geometric mean over seeds of the paired ratios, bounded from above by a
+bootstrap over seeds; that of two variances is of all seeds together, bounded by a jackknife.  A claim holds if that bound does
+not exceed what it states, and so never for a lack of data.  All claims must hold, which needs no correction for their number.
 """
 from __future__ import annotations
 
@@ -78,7 +78,6 @@ def judge(experiment: Experiment, results: Results, references: dict[str, Refere
 
 def _ratio(claim: Claim, better: list[Cell], worse: list[Cell], reference: Reference | None) -> statistics.Interval:
     n = len(better)
-    band = statistics.expanded_band(claim.confidence, n)
     images = [[cell.image()["mean"] for cell in cells] for cells in (better, worse)]
     if claim.metric in metrics.OVER_SEEDS:
         variance = metrics.OVER_SEEDS[claim.metric]
@@ -87,12 +86,13 @@ def _ratio(claim: Claim, better: list[Cell], worse: list[Cell], reference: Refer
         def of_variances(index: np.ndarray) -> float:
             a, b = (variance(w.luminance[index], w.seconds[index]) for w in works)
             return a / b if b > 0 else float("nan")
-        return statistics.bootstrap(of_variances, n, least=2, band=band)
+        return statistics.jackknife(of_variances, n, least=2, confidence=claim.confidence)
     assert reference is not None
     metric = metrics.METRICS[claim.metric]
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = (np.log([metric(image, reference.mean) for image in method]) for method in images)
-        return statistics.bootstrap(lambda index: float(np.exp(np.mean(a[index] - b[index]))), n, band=band)
+        return statistics.bootstrap(lambda index: float(np.exp(np.mean(a[index] - b[index]))), n,
+                                    band=statistics.expanded_band(claim.confidence, n))
 
 
 def write(verdicts: list[Verdict], results: Results) -> None:

@@ -5,6 +5,7 @@ there, and never beyond what was measured.  Seeds are paired: seed i of one meth
 """
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -26,11 +27,18 @@ class Band(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """An estimate and its interval (90 %), NaN where there is none."""
+    """An estimate and its interval (90 %), NaN where there is none or it is open."""
     value: float
     low: float
     high: float
     bound: str = ""         # ">": at least the value; "<": at most
+
+    def ends(self, dash: str = "-") -> str:
+        """The interval in brackets, after a space; empty where there is none, or a bound in place of the estimate."""
+        low, high = (f"{end:.2g}" if np.isfinite(end) else "" for end in (self.low, self.high))
+        if self.bound or not (low or high):
+            return ""
+        return f" ({low}{dash}{high})" if low and high else f" (>{low})" if low else f" (<{high})"
 
 
 class Curve(NamedTuple):
@@ -134,13 +142,14 @@ def bootstrap(statistic: Callable[[np.ndarray], float], n: int, seed: int = 0, l
     return Interval(value, float(low), float(high))
 
 
-def jackknife(statistic: Callable[[np.ndarray], float], n: int, least: int = 1) -> Interval:
+def jackknife(statistic: Callable[[np.ndarray], float], n: int, least: int = 1, confidence: float = BAND[1] / 100) -> Interval:
     """Interval of a positive statistic of seeds from its logarithm without one of them at a time (Tukey 1958), by Student's t.
 
     For statistics that count how often a seed was drawn, as variances do: a bootstrap draws some twice.
 
     Args:
         statistic, n, least: as in `bootstrap`.
+        confidence: that of each end.
 
     Returns:
         The interval is NaN with `least` seeds or fewer, and where the statistic without some seed has no logarithm.
@@ -151,7 +160,7 @@ def jackknife(statistic: Callable[[np.ndarray], float], n: int, least: int = 1) 
         return Interval(value, float("nan"), float("nan"))
     with np.errstate(invalid="ignore", divide="ignore"):
         without = np.log([statistic(np.delete(seeds, i)) for i in seeds])
-    reach = np.exp(special.stdtrit(n - 1, BAND[1] / 100) * np.sqrt((n - 1) * np.var(without)))
+    reach = np.exp(special.stdtrit(n - 1, confidence) * np.sqrt((n - 1) * np.var(without)))
     return Interval(value, float(value / reach), float(value * reach))
 
 
@@ -174,12 +183,15 @@ def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Inte
 
     Returns:
         NaN where one of them does not reach the error, or both start below it.  Where only one starts below, the
-        ratio with its first time bounds the speed-up, and `bound` says from which side.
+        ratio with its first time bounds the speed-up, and `bound` says from which side; where so many resamples are
+        bounded that an end of the interval is, too, that end is NaN.
     """
     _paired(baseline, method)
+    n = len(method.errors)
 
-    def ratio(index: np.ndarray) -> tuple[float, str]:
-        a, b = (np.median(curve.errors[index], axis=0) for curve in (baseline, method))
+    @functools.cache
+    def ratio(*index: int) -> tuple[float, str]:
+        a, b = (np.median(curve.errors[list(index)], axis=0) for curve in (baseline, method))
         level = max(a.min(), b.min()) if error is None else error
         below = a[0] < level, b[0] < level
         if all(below):
@@ -187,8 +199,17 @@ def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Inte
         time_a = baseline.times[0] if below[0] else time_to_error(baseline.times, a, level)
         time_b = method.times[0] if below[1] else time_to_error(method.times, b, level)
         return float(time_a / time_b), "<" if below[0] else ">" if below[1] else ""
-    interval = bootstrap(lambda index: ratio(index)[0], len(method.errors))
-    return interval._replace(bound=ratio(np.arange(len(method.errors)))[1])
+
+    def end(bound: str, infinite: float) -> Interval:
+        """The interval when bounds of one kind are as far off as they can be."""
+        def of_resample(index: np.ndarray) -> float:
+            value, found = ratio(*np.sort(index))
+            return infinite if found == bound else value
+        with np.errstate(invalid="ignore"):         # between infinities
+            return bootstrap(of_resample, n)
+    value, bound = ratio(*range(n))
+    low, high = end("<", -np.inf).low, end(">", np.inf).high
+    return Interval(value, low if np.isfinite(low) else float("nan"), high if np.isfinite(high) else float("nan"), bound)
 
 
 def error_ratio(baseline: Curve, method: Curve, seconds: float | None = None) -> Interval:

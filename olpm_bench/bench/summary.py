@@ -264,9 +264,8 @@ def speed_up_lines(found: Mapping[str, Mapping[str, statistics.Interval]], basel
 def _ratio(interval: statistics.Interval, baseline: str) -> str:
     if not math.isfinite(interval.value):
         return f"shares no L1 error with {baseline}"
-    spread = f" ({interval.low:.2g}-{interval.high:.2g})" if math.isfinite(interval.low) and not interval.bound else ""
     bound = {">": "more than ", "<": "less than ", "": ""}[interval.bound]
-    return f"{bound}{interval.value:.2g}x{spread} as fast as {baseline} at equal L1"
+    return f"{bound}{interval.value:.2g}x{interval.ends()} as fast as {baseline} at equal L1"
 
 
 def number(value: float | None) -> str:

@@ -265,8 +265,7 @@ def speed_up_label(interval: statistics.Interval) -> str:
     """A speed-up, with its interval where there is one; empty where two curves share no error."""
     if not math.isfinite(interval.value):
         return ""
-    spread = f" ({interval.low:.2g}\N{EN DASH}{interval.high:.2g})" if math.isfinite(interval.low) and not interval.bound else ""
-    return f"{interval.bound}{interval.value:.2g}{TIMES}{spread}"
+    return f"{interval.bound}{interval.value:.2g}{TIMES}" + interval.ends("\N{EN DASH}")
 
 
 def text_width(text: str, size: float) -> float:

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from olpm_bench.bench import experiment_file, gate, metrics, run, statistics
-from olpm_bench.bench.config import ConfigError, Experiment
+from olpm_bench.bench.config import Claim, ConfigError, Experiment
 from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.bench.results import Results
 from olpm_bench.cli import app
@@ -79,6 +80,8 @@ def test_the_ratio_is_that_of_the_metrics(known, metric, expected):
     assert holding.ratio == pytest.approx(expected, rel=0.15) and holding.low < holding.ratio < holding.high
     assert (holding.ratio, holding.low, holding.high) == (failing.ratio, failing.low, failing.high)
     assert holding.holds and not failing.holds
+    if metric in metrics.OVER_SEEDS:            # a jackknife's, as those of gains
+        assert holding.high / holding.ratio == pytest.approx(holding.ratio / holding.low)
 
 
 def test_errors_are_paired_and_averaged_as_ratios(known):
@@ -149,6 +152,19 @@ def test_claims_that_are_false_by_a_hair_pass_as_rarely_as_they_say():
     for _ in range(trials):
         ratios = rng.normal(0, 0.2, SEEDS)
         passed += statistics.bootstrap(lambda index, ratios=ratios: ratios[index].mean(), SEEDS, band=band).high <= 0
+    assert stats.binomtest(passed, trials, 0.05, alternative="greater").pvalue > 1e-3
+    assert passed > 0
+
+
+def test_claims_on_variances_that_are_false_by_a_hair_pass_as_rarely_as_they_say():
+    """The same of variances over 8 seeds, of skewed pixels and of guides that differ in how much noise they leave."""
+    rng, trials, passed = np.random.default_rng(7), 200, 0
+    claim = Claim(better="Better", worse="Worse", metric="relative_variance", ratio=1.0)
+    for _ in range(trials):
+        noise = 0.1 * np.exp(0.2 * rng.standard_normal((2, SEEDS, 1, 1, 1))) * (rng.gamma(1, size=(2, SEEDS, 8, 8, 1)) - 1)
+        better, worse = ([SimpleNamespace(info={"charged_seconds": 1.0}, image=lambda image=image: {"mean": image})
+                          for image in np.repeat(1 + method, 3, axis=-1)] for method in noise)
+        passed += gate._ratio(claim, better, worse, None).high <= claim.ratio
     assert stats.binomtest(passed, trials, 0.05, alternative="greater").pvalue > 1e-3
     assert passed > 0
 
