@@ -21,6 +21,7 @@ from olpm_bench.bench.reference_file import Reference, find_reference, read_refe
 from olpm_bench.bench.results import Cell, Results
 from olpm_bench.bench.shard import WHOLE, Shard
 from olpm_bench.transport import camera_paths, headroom
+from olpm_bench.transport.settings import InputError
 
 LARGER = 8                  # references are averaged down by whole factors up to this
 PATIENCE = 2.0              # [s] between looks at what is in other hands
@@ -72,7 +73,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
     Raises:
         ConfigError: no such scene.
         ResultError: a reference is missing (nothing was run), or a result is of a newer schema.
-        InputError: a cell needs more memory than there is.
+        InputError: a cell needs more memory than there is (nothing was run).
         SceneError, OSError: a scene cannot be used; a file cannot be written.
     """
     results, part = Results(root / experiment.stem), experiment.of_scenes(only)
@@ -169,9 +170,11 @@ def _run_cell(results: Results, spec: CellSpec, scene: mi.Scene, warm: dict[tupl
                 bar.at(index, f"{spec}: compiling")
                 warm[pair] = warm_up(spec, scene)
             done = measure(spec, scene, warm[pair], on_progress=on_progress)
-        except CellFailedError as error:
-            results.write_failure(*names, str(error))
+        except (LockedError, NewerSchemaError):
             raise
+        except (CellFailedError, InputError) as error:      # e.g. too little memory
+            results.write_failure(*names, str(error))
+            raise CellFailedError(str(error)) from error
         except RuntimeError as error:           # of Mitsuba or Dr.Jit: the other cells may still work
             if is_interrupt(error):
                 raise KeyboardInterrupt from error

@@ -18,6 +18,7 @@ from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.lock import locked
 from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.bench.results import Results
+from olpm_bench.transport.settings import InputError
 
 
 @pytest.fixture
@@ -114,7 +115,8 @@ def test_an_interruption_loses_the_cell_in_hand_only(experiment, root, monkeypat
     assert run.run(experiment, root) == [] and counted.calls == 2
 
 
-@pytest.mark.parametrize("error", [CellFailedError("3 pixels are NaN"), RuntimeError("jit:\n failure")])
+@pytest.mark.parametrize("error", [CellFailedError("3 pixels are NaN"), RuntimeError("jit:\n failure"),
+                                   InputError("the records take about 9 GB, and 3 GB are free: fewer of them")])
 def test_a_failed_cell_is_named_and_the_others_are_run(experiment, root, monkeypatch, error):
     monkeypatch.setattr(run, "measure", Counted(fail_at=2, error=error))
     problems = run.run(experiment, root)
