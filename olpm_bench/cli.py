@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import functools
 import json
-import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -168,18 +167,21 @@ def submit(experiment: ExperimentFile, results: ResultsFolder = Path("results"),
     except ModuleNotFoundError as error:
         raise InputError(f"submit needs {error.name}: pip install 'olpm-bench[cluster]'") from None
     from olpm_bench.bench import run as runner
+    from olpm_bench.bench.results import Results
 
     runner.references(loaded, results)          # before the cluster is asked
     jobs = submission.submit(loaded, results, cluster, workers, minutes, _replacements(scene), scale,
                              partition=partition, account=account, constraint=constraint)
     if cluster == "slurm":
         print(f"submitted: {', '.join(job.job_id for job in jobs)}; once they have ended, this draws the figures: "
-              f"{shlex.join([*loaded.command('run'), '--results', str(results)])}")
+              f"{loaded.command('run', results)}")
         return
     submission.wait(jobs, loaded, results)
     if left := runner.plan(loaded, results)["todo"]:
+        stored = Results(results / loaded.stem)
         for spec in left:
-            complain(f"{spec} is not complete")
+            failure = stored.failure(spec.scene.name, spec.method.name, spec.seed)
+            complain(f"{spec}: {failure[1]}" if failure else f"{spec} is not complete")
         complain(f"{len(left)} of {len(loaded.cells())} cells are not complete; no table and no figures; "
                  f"logs are in {results / loaded.stem / 'jobs'}")
         raise typer.Exit(FAILED)
@@ -254,6 +256,7 @@ def metrics(experiment: Annotated[Path, typer.Argument(metavar="RESULTS|EXPERIME
     """Compute every metric anew from the images of an experiment; nothing is rendered."""
     is_folder = experiment.is_dir()
     loaded = _load(experiment / "experiment.toml" if is_folder else experiment, scene, scale)
+    loaded = loaded.of_results(experiment.resolve()) if is_folder else loaded
     folder = experiment if is_folder else results / loaded.stem
     from olpm_bench.bench import environment
 
@@ -333,7 +336,7 @@ def inspect(run: Annotated[Path, typer.Argument(metavar="RUN", help="An experime
             path_seed: Annotated[int, typer.Option(min=0, help="Of that path.")] = 0,
             guide: Annotated[list[str], typer.Option(metavar="METHOD=FILE.npz", help="Use this guide; train none.")] = [],  # noqa: B006
             passes: Annotated[int, typer.Option(min=2, help="Of the truth, 64 paths a bin each.")] = 16,
-            results: ResultsFolder = Path("results")) -> None:
+            results: ResultsFolder = Path("results"), scale: Scale = None) -> None:
     """Show what guides have learnt where a pixel looks: their densities, particles and records beside the truth."""
     from olpm_bench.bench import environment
 
@@ -341,11 +344,11 @@ def inspect(run: Annotated[Path, typer.Argument(metavar="RUN", help="An experime
     pixels, guides = [_pixel(text) for text in pixel], dict(_named_file(text, "--guide") for text in guide)
     if run.is_dir() and not (run / "experiment.toml").is_file():
         raise InputError(f"{run}: no experiment.toml in it, so it is not the results folder of an experiment")
-    loaded = _load(run / "experiment.toml" if run.is_dir() else run, [f"{name}={file}"] if file else [])
+    loaded = _load(run / "experiment.toml" if run.is_dir() else run, [f"{name}={file}"] if file else [], scale)
     environment.select_variant()
     from olpm_bench.bench import inspect as inspector
 
-    written = inspector.inspect(loaded, run if run.is_dir() else results / run.stem, pixels, scene=name or None, seed=seed,
+    written = inspector.inspect(loaded, run if run.is_dir() else results / loaded.stem, pixels, scene=name or None, seed=seed,
                                 number=vertex, path_seed=path_seed, passes=passes, guides=guides)
     for path in written:
         print(path)

@@ -12,6 +12,7 @@ import importlib.metadata
 import inspect
 import json
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -269,6 +270,7 @@ class Experiment(Table):
     scale: dict[str, dict[str, Any]] = {}
     _path: Path = PrivateAttr(Path("EXPERIMENT.toml"))
     _scale: str | None = PrivateAttr(None)
+    _scenes: dict[str, Path] = PrivateAttr({})          # what `--scene` gave
 
     @property
     def path(self) -> Path:
@@ -280,9 +282,11 @@ class Experiment(Table):
         """Name of its results folder: the file's, and the scale's."""
         return self.path.stem if self._scale is None else f"{self.path.stem}-{slug(self._scale)}"
 
-    def command(self, name: str) -> list[str]:
-        """Words of the command `name` of this experiment, for messages."""
-        return ["olpm-bench", name, str(self.path), *(["--scale", self._scale] if self._scale is not None else [])]
+    def command(self, name: str, root: Path) -> str:
+        """The command `name` of this experiment, for a shell in the current folder; `root` is the `--results` folder."""
+        scale = ["--scale", self._scale] if self._scale is not None else []
+        scenes = [f"--scene={scene}={os.path.relpath(file)}" for scene, file in self._scenes.items()]
+        return shlex.join(["olpm-bench", name, str(self.path), *scale, "--results", os.path.relpath(root), *scenes])
 
     @field_validator("schema_version")
     @classmethod
@@ -387,6 +391,7 @@ class Experiment(Table):
             named._path, named._scale = scaled, scale
         else:
             named._path = original if original.is_file() else Path(original.name)
+        named._scenes = {scene.name: scene.file for scene in self.scene if scene.file is not None}
         return named
 
     def reference_key(self, scene: Scene) -> str:

@@ -64,7 +64,7 @@ def load(path: Path | str, scenes: dict[str, Path] | None = None, scale: str | N
         except InputError as error:
             raise ConfigError(str(error)) from None
     experiment = parse(data, source, path.parent, scenes or {})
-    experiment._path, experiment._scale = path, scale
+    experiment._path, experiment._scale, experiment._scenes = path, scale, dict(scenes or {})
     return experiment
 
 

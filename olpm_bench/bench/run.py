@@ -1,7 +1,6 @@
 """An experiment: all its cells, resumable, methods interleaved; then its table and figures."""
 from __future__ import annotations
 
-import shlex
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -42,7 +41,7 @@ def references(experiment: Experiment, root: Path) -> dict[str, Reference]:
         path = scene.reference or _reference(experiment, scene, root)
         if path is None:
             raise ResultError(f"scene {scene.name} has no reference {experiment.reference_key(scene)}; make it with: "
-                              f"{shlex.join(experiment.command('reference'))}, or do without: reference = \"none\"")
+                              f"{experiment.command('reference', root)}, or do without: reference = \"none\"")
         found[scene.name] = read_reference(path, scene.width, scene.height)
     return found
 

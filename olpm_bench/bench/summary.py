@@ -7,7 +7,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +42,8 @@ def complete_cells(experiment: Experiment, results: Results, any_version: bool =
         if cell is None or not (cell.info.get("key") == spec.key
                                 or (any_version and _agrees(cell.config(), plain(spec.config())))):
             state = "missing" if cell is None else "of another configuration"
-            raise ResultError(f"cell {spec} in {results.folder} is {state}; make it with: {_command('run', experiment, results)}")
+            raise ResultError(f"cell {spec} in {results.folder} is {state}; make it with: "
+                              f"{experiment.command('run', results.folder.parent)}")
         cells[spec.scene.name, spec.method.name].append(cell)
     return cells
 
@@ -71,12 +71,9 @@ def scene_reference(references: Mapping[str, Reference], scene: Scene, results: 
     if not scene.has_reference:
         return None
     if scene.name not in references:
-        raise ResultError(f"scene {scene.name} has no reference; make it with: {_command('reference', experiment, results)}")
+        raise ResultError(f"scene {scene.name} has no reference; make it with: "
+                          f"{experiment.command('reference', results.folder.parent)}")
     return references[scene.name]
-
-
-def _command(name: str, experiment: Experiment, results: Results) -> str:
-    return shlex.join([*experiment.command(name), "--results", str(results.folder.parent)])
 
 
 def error_curve(cells: Sequence[Cell], reference: Reference,

@@ -10,9 +10,7 @@ import html
 import importlib.metadata
 import itertools
 import math
-import os
 import re
-import shlex
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -75,7 +73,7 @@ def page(results: Results, experiment: Experiment, references: Mapping[str, Refe
                                      lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     text = environment.get_template(TEMPLATE).render(
         experiment=experiment, budget=sheet.budget(experiment), commands=commands(experiment, results),
-        command=shlex.join(experiment.command("run")),
+        command=experiment.command("run", results.folder.parent),
         viewers=viewers(results, experiment, references), headers=HEADERS, rows=table(summarised["rows"]),
         speed_ups=summary.speed_up_lines(found, experiment.baseline_name),
         figures=[{"name": name, "svg": svg(results.folder / f"{name}.svg", CAPTIONS[name]), "caption": CAPTIONS[name]}
@@ -87,10 +85,8 @@ def page(results: Results, experiment: Experiment, references: Mapping[str, Refe
 
 def commands(experiment: Experiment, results: Results) -> list[str]:
     """What makes these results: the references, if there are any, and then the run."""
-    given = [f"--scene={scene.name}={os.path.relpath(scene.file)}" for scene in experiment.scene if scene.file is not None]
     names = ["reference"] * any(scene.has_reference for scene in experiment.scene) + ["run"]
-    return [shlex.join([*experiment.command(name), "--results", os.path.relpath(results.folder.parent), *given])
-            for name in names]
+    return [experiment.command(name, results.folder.parent) for name in names]
 
 
 # ---------------------------------------------------------------- images

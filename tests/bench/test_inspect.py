@@ -85,6 +85,15 @@ def test_guides_are_read_from_files_and_paths_followed(experiment, tmp_path):
     assert (tmp_path / "test" / "inspect" / "cornell_box_8_10_vertex2.pdf").is_file()
 
 
+def test_a_scale_has_pictures_of_its_own(experiment, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(inspect, "inspect", lambda loaded, folder, *_, **__: asked.append((loaded.scene[0].width, folder)) or [])
+    experiment.write_text(TOML + "[scale.small]\nscene = { width = 8, height = 6 }\n")
+    result = call("inspect", experiment, "--scale", "small", "--pixel", "1,1", "--results", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert asked == [(8, tmp_path / "test-small")]
+
+
 @pytest.mark.parametrize("arguments, words", [
     (("missing.toml", "--pixel", "1,1"), ["missing.toml", "no such file"]),
     ((".", "--pixel", "1,1"), ["no experiment.toml", "results folder"]),

@@ -1,16 +1,20 @@
 """Scales: what they change, what they refuse, and which reference serves them."""
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from olpm_bench.bench import config, experiment_file, run, scale
+from olpm_bench.bench import config, experiment_file, run, scale, summary
 from olpm_bench.bench.config import ConfigError
 from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.bench.results import Results
+from olpm_bench.cli import app
+from olpm_bench.report import page
 
 TOML = """
 title = "Test"
@@ -81,13 +85,39 @@ def test_crops_are_of_one_size_of_the_image():
 def test_a_scale_has_results_and_commands_of_its_own(tmp_path):
     full, small = load(tmp_path, None), load(tmp_path, "small")
     assert (full.stem, small.stem) == ("test", "test-small")
-    assert small.command("run") == ["olpm-bench", "run", str(tmp_path / "test.toml"), "--scale", "small"]
+    words = ["olpm-bench", "run", str(tmp_path / "test.toml"), "--scale", "small"]
+    assert shlex.split(small.command("run", Path("my results"))) == [*words, "--results", "my results"]
     assert small.of_scenes(["door_ajar"]).stem == "test-small"
     with pytest.raises(ResultError, match=r"olpm-bench reference .*test\.toml --scale small"):
         run.run(small, tmp_path / "results")
     assert not (tmp_path / "results").exists()
     (tmp_path / "resolved.toml").write_text(small.toml())
     assert [c.key for c in experiment_file.load(tmp_path / "resolved.toml").cells()] == [c.key for c in small.cells()]
+
+
+def test_the_commands_that_are_suggested_are_those_that_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my room.xml").write_text('<scene version="3.0.0"/>')
+    Path("test.toml").write_text(TOML.replace('"cornell_box"', '"room"\nfile = "missing.xml"') + SMALL)
+    small = experiment_file.load("test.toml", {"room": Path("my room.xml")}, "small")
+    results, said = Results("out/test-small"), []
+    for fails in (lambda: run.references(small.of_scenes(["door_ajar"]), Path("out")),
+                  lambda: summary.complete_cells(small, results),
+                  lambda: summary.scene_reference({}, small.scene[0], results, small)):
+        with pytest.raises(ResultError) as error:
+            fails()
+        said.append(str(error.value).partition("make it with: ")[2].partition(", or do without")[0])
+    for command in (*said, *page.commands(small, results)):
+        words = shlex.split(command)
+        assert words[0] == "olpm-bench" and words[1] in ("run", "reference")
+        assert words[2:] == ["test.toml", "--scale", "small", "--results", "out", "--scene=room=my room.xml"]
+    result = CliRunner().invoke(app, [*words[1:], "--dry-run"])
+    assert words[1] == "run" and result.exit_code == 0, result.output
+    results.write_text("experiment.toml", small.toml(results.folder))
+    Path("experiments").mkdir()
+    Path("test.toml").rename("experiments/test.toml")
+    again = experiment_file.load(results.folder / "experiment.toml").of_results(results.folder.resolve())
+    assert shlex.split(again.command("run", Path("out"))) == [*words[:2], "experiments/test.toml", *words[3:]]
 
 
 @pytest.mark.parametrize("scale, text, words", [

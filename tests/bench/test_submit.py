@@ -157,6 +157,20 @@ def test_a_failure_of_another_worker_is_not_repeated(experiment, tmp_path, monke
     assert len(run.run(loaded, tmp_path / "results", together=True)) == 2 and len(calls) == 2       # another day, another try
 
 
+def test_why_local_workers_failed_is_said(experiment, tmp_path, monkeypatch):
+    from olpm_bench.bench import submit
+
+    experiment.write_text(TOML.replace("seeds = 4", "seeds = 1"))
+    monkeypatch.setattr(submit, "submit", lambda *_, **__: [])
+    monkeypatch.setattr(submit, "wait", lambda *_: None)
+    Results(tmp_path / "results" / "shared").write_failure("cornell_box", "Roulette", 0, "3 pixels are NaN")
+    result = call("submit", experiment, "--results", tmp_path / "results", "--cluster", "local")
+    assert result.exit_code == 1
+    assert [line.removeprefix("olpm-bench: cornell_box / ") for line in result.stderr.splitlines()[:2]] == [
+        "Path tracing / seed 0 is not complete", "Roulette / seed 0: 3 pixels are NaN"]
+    assert "2 of 2 cells are not complete" in result.stderr
+
+
 def test_what_is_in_other_hands_is_waited_for(experiment, tmp_path, monkeypatch):
     from olpm_bench.bench import run
     from olpm_bench.bench.lock import locked
@@ -200,6 +214,7 @@ def test_slurm_gets_an_array_of_whole_nodes_of_one_model(experiment, tmp_path, m
     result = call("submit", experiment, "--results", results, "--workers", 3, "--constraint", "epyc7763", "--minutes", 90)
     assert result.exit_code == 0, result.output
     assert "submitted: 42_0, 42_1, 42_2" in result.stdout
+    assert experiment_file.load(experiment).command("run", results) in result.stdout
     asked = (tmp_path / "asked").read_text()
     for line in ("exclusive", "array=0-2%3", "constraint=epyc7763", "nodes=1", "time=90", "mem=0"):
         assert f"#SBATCH --{line}\n" in asked
