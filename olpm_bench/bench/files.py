@@ -91,6 +91,15 @@ def here() -> dict[str, str]:
         return {"boot": f"{uuid.getnode():x}", "numbers": ""}
 
 
+def require_inside(folder: Path, root: Path) -> None:
+    """
+    Raises:
+        ResultError: a link on the way from `root` to `folder` leads out of it; nothing is written there.
+    """
+    if not Path(found := os.path.realpath(folder)).is_relative_to(os.path.realpath(root)):
+        raise ResultError(f"{folder} is {found}, by a link that leads out of {root}: nothing is written there")
+
+
 def writer() -> str:
     """Who writes, in the names of unfinished files."""
     return f"{digest(*(part.encode() for part in here().values()))}-{os.getpid()}"

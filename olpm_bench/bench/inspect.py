@@ -21,7 +21,7 @@ from olpm_bench.bench import cell as cells
 from olpm_bench.bench import environment, vertex
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec, ConfigError, Experiment
-from olpm_bench.bench.files import SCHEMA_VERSION, slug, write_json
+from olpm_bench.bench.files import SCHEMA_VERSION, require_inside, slug, write_json
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.results import Results
 from olpm_bench.report import figures, landings, records
@@ -65,8 +65,9 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
 
     Raises:
         ConfigError: no such scene or method, or a pixel without such a vertex.
-        InputError, OSError: a guide that can't be read or trained.
+        InputError, OSError: a guide that can't be read or trained; a link that leads out of `folder`.
     """
+    require_inside(folder / "inspect", folder)
     specs = _specs(experiment, scene, experiment.seeds[0] if seed is None else seed)
     guided = [spec for spec in specs if spec.training is not None]
     files, name = dict(guides or {}), specs[0].scene.name

@@ -17,7 +17,7 @@ from olpm_bench.bench import cell, environment
 from olpm_bench.bench.accumulator import Accumulator
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec, Experiment
-from olpm_bench.bench.files import ResultError
+from olpm_bench.bench.files import ResultError, require_inside
 from olpm_bench.bench.lock import locked
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.reference_file import Reference, find_reference, read_reference, write_reference
@@ -81,7 +81,7 @@ def improve(experiment: Experiment, root: Path, seconds: float) -> dict[str, Pat
         Scene name -> reference folder.
 
     Raises:
-        ResultError: one that is there is broken or newer, or another process is at work on it.
+        ResultError: one that is there is broken or newer, another process is at work on it, or a link leads out of `root`.
         SceneError, OSError: a scene cannot be used; a file cannot be written.
     """
     specs = {spec.scene.name: spec for spec in experiment.cells() if spec.scene.reference is None}
@@ -95,6 +95,7 @@ def improve(experiment: Experiment, root: Path, seconds: float) -> dict[str, Pat
 def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float, bar: Bar, done: float) -> Path:
     key = spec.reference_key
     folder = root / "references" / key
+    require_inside(folder, root)
     with locked(folder) as alive:
         halves = Halves.start(spec.scene.width, spec.scene.height,
                               find_reference(key, reference_folders(experiment, root)))

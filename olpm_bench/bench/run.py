@@ -13,7 +13,7 @@ from olpm_bench.bench import environment
 from olpm_bench.bench.cell import CellFailedError, WarmUp, load_scene, measure, spp_of_pass, warm_up
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.config import CellSpec, Experiment, Scene
-from olpm_bench.bench.files import NewerSchemaError, ResultError
+from olpm_bench.bench.files import NewerSchemaError, ResultError, require_inside
 from olpm_bench.bench.lock import LockedError, locked, remove_unfinished, tidy
 from olpm_bench.bench.progress import Bar, is_interrupt, reason
 from olpm_bench.bench.reference_file import Reference, find_reference, read_reference
@@ -71,13 +71,16 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
 
     Raises:
         ConfigError: no such scene.
-        ResultError: a reference is missing (nothing was run), or a result is of a newer schema.
+        ResultError: a reference is missing, or links lead out of the results folder (nothing was run), or a result is of a
+            newer schema.
         InputError: a cell needs more memory than there is (nothing was run).
         SceneError, OSError: a scene cannot be used; a file cannot be written.
     """
     results, part = Results(root / experiment.stem), experiment.of_scenes(only)
     references(part, root)                                  # before hours of work, not after
     cells = shard.first(part.cells()) if together else shard.of(part.cells())
+    for folder in (results.folder, *(results.cell_folder(c.scene.name, c.method.name, c.seed) for c in cells)):
+        require_inside(folder, root)
     todo, problems = [], []
     for spec in cells:
         complete, why = is_complete(results, spec)

@@ -17,6 +17,7 @@ from submitit.helpers import Checkpointable
 from olpm_bench.bench import environment, experiment_file
 from olpm_bench.bench.clock import cores
 from olpm_bench.bench.config import ConfigError, Experiment
+from olpm_bench.bench.files import require_inside
 from olpm_bench.bench.lock import LEASE, silence
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.results import Results
@@ -68,11 +69,12 @@ def submit(experiment: Experiment, root: Path, cluster: str, workers: int, minut
     if cluster == "local" and workers > 1 and timed:
         raise ConfigError(f"--workers {workers}: the budget of {experiment.path.name} is in seconds, and two timed cells at once "
                           "would disturb each other; one worker a machine")
-    folder = Results(root / experiment.stem).folder.resolve() / "jobs"
+    folder = Results(root / experiment.stem).folder / "jobs"
+    require_inside(folder, root)
     worker = Worker(experiment.path.resolve(), root.resolve(), {name: path.resolve() for name, path in scenes.items()},
                     scale, max(1, cores() // workers) if cluster == "local" else None)
     try:
-        executor = submitit.AutoExecutor(folder, cluster=cluster)
+        executor = submitit.AutoExecutor(folder.resolve(), cluster=cluster)
     except RuntimeError as error:
         raise ConfigError(f"--cluster {cluster}: {error}") from None
     executor.update_parameters(name=experiment.stem, timeout_min=minutes)

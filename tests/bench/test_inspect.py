@@ -94,6 +94,13 @@ def test_a_scale_has_pictures_of_its_own(experiment, tmp_path, monkeypatch):
     assert asked == [(8, tmp_path / "test-small")]
 
 
+def test_no_link_leads_out_of_the_results_folder(experiment, tmp_path):
+    (tmp_path / "test").mkdir()
+    (tmp_path / "test" / "inspect").symlink_to("/sys")
+    said = complaint(call("inspect", experiment, "--pixel", "1,1", "--results", tmp_path))
+    assert "test/inspect is /sys, by a link that leads out of" in said
+
+
 @pytest.mark.parametrize("arguments, words", [
     (("missing.toml", "--pixel", "1,1"), ["missing.toml", "no such file"]),
     ((".", "--pixel", "1,1"), ["no experiment.toml", "results folder"]),

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from small_experiment import TOML
 
-from olpm_bench.bench import experiment_file, run
+from olpm_bench.bench import experiment_file, reference, run
 from olpm_bench.bench.cell import CellFailedError
 from olpm_bench.bench.config import Experiment
-from olpm_bench.bench.files import ResultError
+from olpm_bench.bench.files import ResultError, require_inside
 from olpm_bench.bench.lock import locked
 from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.bench.results import Results
@@ -133,6 +133,22 @@ def test_a_cell_in_other_hands_is_left_alone(experiment, root):
     assert len(problems) == 1 and "held by process" in problems[0]
     assert problems[0].startswith("cornell_box / Roulette / seed 1: ")
     assert run.run(experiment, root) == []
+
+
+@pytest.mark.parametrize("link", ["test", "test/cells", "test/cells/cornell_box/Roulette/1", "references"])
+def test_no_link_leads_out_of_the_results_folder(experiment, tmp_path, root, link):
+    (unfinished := tmp_path / "elsewhere" / "cells" / ".notes.tmp").mkdir(parents=True)
+    if link == "references":
+        (root / link).rename(root / "kept")
+    (root / link).parent.mkdir(parents=True, exist_ok=True)
+    (root / link).symlink_to(unfinished.parent)
+    with pytest.raises(ResultError, match=rf"{link}.* is {tmp_path}/elsewhere/cells.*, by a link that leads out of {root}: "):
+        reference.improve(experiment, root, 1) if link == "references" else run.run(experiment, root)
+    assert [*(tmp_path / "elsewhere").rglob("*")] == [unfinished.parent, unfinished]
+    (tmp_path / "linked").symlink_to(root)          # it may be one itself, and links may stay in it
+    require_inside(tmp_path / "linked" / "other" / "cells", root)
+    (root / "inside").symlink_to(root / "kept")
+    require_inside(root / "inside" / "1", root)
 
 
 def test_a_missing_reference_is_noticed_before_the_first_cell(experiment, tmp_path):

@@ -94,7 +94,7 @@ def test_speed_up_only_where_both_curves_reach_the_error():
 
 
 def test_an_end_of_a_speed_up_that_was_not_measured_is_open():
-    """In 3 of 10 resamples of 5 seeds the fast curve starts below the error: there the speed-up is more than its first time says."""
+    """In 3 of 10 resamples of 5 seeds the fast curve starts below the error: the speed-up is more than its first time says."""
     slow, fast = curve(3.8, 3.9, 4, 4.1, 4.2), curve(2.3, 2.4, 2.6, 2.7, 2.8)
     faster, slower = statistics.speed_up(slow, fast, error=2.5), statistics.speed_up(fast, slow, error=2.5)
     assert faster.value == pytest.approx((4 / 2.6) ** 2) and faster.bound == slower.bound == ""

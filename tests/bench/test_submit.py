@@ -215,6 +215,10 @@ def test_slurm_gets_an_array_of_whole_nodes_of_one_model(experiment, tmp_path, m
     assert result.exit_code == 0, result.output
     assert "submitted: 42_0, 42_1, 42_2" in result.stdout
     assert experiment_file.load(experiment).command("run", results) in result.stdout
+    (results / "shared" / "jobs").rename(tmp_path / "jobs")
+    (results / "shared" / "jobs").symlink_to(tmp_path / "jobs")
+    refused = call("submit", experiment, "--results", results)
+    assert refused.exit_code == 2 and "by a link that leads out of" in refused.stderr
     asked = (tmp_path / "asked").read_text()
     for line in ("exclusive", "array=0-2%3", "constraint=epyc7763", "nodes=1", "time=90", "mem=0"):
         assert f"#SBATCH --{line}\n" in asked
