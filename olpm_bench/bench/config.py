@@ -283,10 +283,10 @@ class Experiment(Table):
         return self.path.stem if self._scale is None else f"{self.path.stem}-{slug(self._scale)}"
 
     def command(self, name: str, root: Path) -> str:
-        """The command `name` of this experiment, for a shell in the current folder; `root` is the `--results` folder."""
+        """The command `name` of this experiment, for a shell; `root` is the `--results` folder."""
         scale = ["--scale", self._scale] if self._scale is not None else []
-        scenes = [f"--scene={scene}={os.path.relpath(file)}" for scene, file in self._scenes.items()]
-        return shlex.join(["olpm-bench", name, str(self.path), *scale, "--results", os.path.relpath(root), *scenes])
+        scenes = [f"--scene={scene}={file}" for scene, file in self._scenes.items()]
+        return shlex.join(["olpm-bench", name, str(self.path), *scale, "--results", str(root), *scenes])
 
     @field_validator("schema_version")
     @classmethod
@@ -391,7 +391,7 @@ class Experiment(Table):
             named._path, named._scale = scaled, scale
         else:
             named._path = original if original.is_file() else Path(original.name)
-        named._scenes = {scene.name: scene.file for scene in self.scene if scene.file is not None}
+        named._scenes = {scene.name: Path(os.path.relpath(scene.file)) for scene in self.scene if scene.file is not None}
         return named
 
     def reference_key(self, scene: Scene) -> str:

@@ -10,8 +10,10 @@ import html
 import importlib.metadata
 import itertools
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,8 +25,6 @@ from olpm_bench.bench.results import Results
 from olpm_bench.report import sheet, tonemap
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from olpm_bench.bench.config import Experiment, Scene
 
 TEMPLATE = "page.html.jinja"
@@ -73,7 +73,7 @@ def page(results: Results, experiment: Experiment, references: Mapping[str, Refe
                                      lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     text = environment.get_template(TEMPLATE).render(
         experiment=experiment, budget=sheet.budget(experiment), commands=commands(experiment, results),
-        command=experiment.command("run", results.folder.parent),
+        command=commands(experiment, results)[-1],
         viewers=viewers(results, experiment, references), headers=HEADERS, rows=table(summarised["rows"]),
         speed_ups=summary.speed_up_lines(found, experiment.baseline_name),
         figures=[{"name": name, "svg": svg(results.folder / f"{name}.svg", CAPTIONS[name]), "caption": CAPTIONS[name]}
@@ -86,7 +86,7 @@ def page(results: Results, experiment: Experiment, references: Mapping[str, Refe
 def commands(experiment: Experiment, results: Results) -> list[str]:
     """What makes these results: the references, if there are any, and then the run."""
     names = ["reference"] * any(scene.has_reference for scene in experiment.scene) + ["run"]
-    return [experiment.command(name, results.folder.parent) for name in names]
+    return [experiment.command(name, Path(os.path.relpath(results.folder.parent))) for name in names]
 
 
 # ---------------------------------------------------------------- images

@@ -161,7 +161,8 @@ def test_a_scale_is_run_and_named_in_commands_to_come(experiment, tmp_path):
     run = ("run", experiment, "--results", results, "--scale")
     assert "2 of 2 cells to run" in call(*run, "small", "--dry-run").stdout
     assert complaint(call(*run, "large")) == "olpm-bench: --scale large: test.toml has no [scale.large]; known: small"
-    assert "test.toml --scale small, or do without" in complaint(call(*run, "small"))     # 5 does not divide 48
+    # 5 does not divide 48:
+    assert f"test.toml --scale small --results {results}, or do without" in complaint(call(*run, "small"))
     assert not (results / "test-small").exists()
 
 
