@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -198,7 +199,7 @@ def _create(path: Path, content: bytes) -> bool:
     except BaseException as error:          # a full disk, Ctrl-C
         for left in (beside, path) if made else (beside,):
             with suppress(OSError):
-                clean_up(left.unlink)
+                clean_up(partial(remove_path, left))
         if isinstance(error, FileExistsError):
             return False
         if isinstance(error, OSError):
