@@ -102,8 +102,7 @@ def test_the_commands_that_are_suggested_are_those_that_work(tmp_path, monkeypat
     small = experiment_file.load("test.toml", {"room": Path("my room.xml")}, "small")
     results, said = Results("out/test-small"), []
     for fails in (lambda: run.references(small.of_scenes(["door_ajar"]), Path("out")),
-                  lambda: summary.complete_cells(small, results),
-                  lambda: summary.scene_reference({}, small.scene[0], results, small)):
+                  lambda: summary.complete_cells(small, results)):
         with pytest.raises(ResultError) as error:
             fails()
         said.append(str(error.value).partition("make it with: ")[2].partition(", or do without")[0])
