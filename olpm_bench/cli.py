@@ -261,12 +261,13 @@ def metrics(experiment: Annotated[Path, typer.Argument(metavar="RESULTS|EXPERIME
     from olpm_bench.bench import environment
 
     environment.select_variant()
+    from olpm_bench.bench import finished, summary
     from olpm_bench.bench import run as runner
-    from olpm_bench.bench import summary
     from olpm_bench.bench.results import Results
 
     stored = Results(folder)
-    found = summary.summarise(loaded, stored, runner.references(loaded, folder.resolve().parent), any_version=True)
+    references = runner.references(loaded, folder.resolve().parent)
+    found = summary.summarise(finished.read(loaded, stored, references, any_version=True))
     summary.write(found, stored)
     summary.print_metrics(found)
     if outdated := sum(not runner.is_complete(stored, spec)[0] for spec in loaded.cells()):

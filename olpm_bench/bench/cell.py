@@ -173,7 +173,11 @@ def power_of_two(n: float) -> int:
 
 @dataclass
 class Measurement:
-    """What a cell yields."""
+    """What a cell yields.
+
+    In `info`, `training_ended` are the charged seconds when the passes of training were done, None without: more than
+    `train_seconds`, which leave out the tracing of images that enter the result.
+    """
     info: dict[str, Any]
     trace: list[dict[str, Any]]
     image: dict[str, np.ndarray]
@@ -281,7 +285,7 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
     Raises:
         CellFailedError: a pixel that is NaN, infinite or negative.
     """
-    spp, training = spp_of_pass(spec, warm), None
+    spp, training, ended = spp_of_pass(spec, warm), None, None
     with Kernels.watched() as kernels:
         cell = _Cell(spec, kernels)
         if guide is None and spec.training is not None:
@@ -291,6 +295,7 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
                 if cell.image.passes:
                     cell.checkpoint(guide)
                 on_progress(min(1.0, cell.spent), f"training pass {statistics.index + 1} of {statistics.passes} at most")
+            ended = cell.clock.charged if cell.training else None
         integrator = make_integrator(spec, guide)
         while cell.spent < 1 or cell.image.passes == 0:
             if training is not None and training.settings.while_rendering and cell.has_room(training.camera_spp):
@@ -306,7 +311,8 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
         "render_seconds": clock["render"].charged, "compile_seconds": warm.compile_seconds + kernels.seconds,
         "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
         "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
-        "trained": guide.trained if guide is not None else None, "training_passes": len(cell.training),
+        "trained": guide.trained if guide is not None else None, "training_ended": ended,
+        "training_passes": len(cell.training),
         "warnings": list(dict.fromkeys(w for p in cell.training for w in p["warnings"])),
         "records": guide.records if guide is not None else 0, "particles": guide.particles if guide is not None else 0,
         "bytes_per_record": guide.bytes_per_record if guide is not None else 0, "invalid_pixels": 0,

@@ -347,6 +347,17 @@ class Experiment(Table):
         last = {m.series.name: m for m in self.method if m.series is not None}
         return [m for m in self.method if len(self.method) <= LOOKS or m.series is None or last[m.series.name] is m]
 
+    @property
+    def looks(self) -> dict[str, int]:
+        """Name of a method or of a sweep -> number of its look, the same in all figures of a report.
+
+        The methods of a sweep share one where there are too many to tell apart.  As a curve, a sweep looks as its last method.
+        """
+        alike = {m.name: m.series.name if m.series is not None and len(self.method) > LOOKS else m.name for m in self.method}
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(alike.values()))}
+        methods = {name: numbers[look] for name, look in alike.items()}
+        return methods | {m.series.name: methods[m.name] for m in self.method if m.series is not None}
+
     def integrator_of(self, scene: Scene, method: Method) -> IntegratorSettings:
         changes = dict(method.integrator)
         if scene.max_depth is not None:

@@ -106,8 +106,10 @@ def describe() -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """What goes into cell.json, where several machines make an experiment."""
-    return {"host": socket.gethostname(), "cpu": _cpu(), "cores": cores()}
+    """What goes into cell.json, where several machines make an experiment.  Needs a variant."""
+    import drjit as dr
+
+    return {"host": socket.gethostname(), "cpu": _cpu(), "cores": cores(), "threads": dr.thread_count()}
 
 
 def _cpu() -> str:

@@ -72,13 +72,6 @@ def relmse_trimmed(x: np.ndarray, r: np.ndarray) -> float:
     return float(np.mean(pixels[:pixels.size - int(WORST * pixels.size)]))
 
 
-def mse_debiased(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Mean (x - a)(x - b): unbiased for the squared error, `a` and `b` being independent halves of the reference."""
-    x, a = _pair(x, a)
-    x, b = _pair(x, b)
-    return float(np.mean((x - a) * (x - b)))
-
-
 def flip(x: np.ndarray, r: np.ndarray) -> float:
     """Mean HDR-FLIP [Andersson et al. 2021], whose range of exposures comes from the reference alone."""
     import flip_evaluator

@@ -3,7 +3,7 @@
 A result folder (`results/<stem of the TOML>`):
 
     experiment.toml  env.json  summary.json  table.csv  report.html  sheet.png
-    {figure,gains}.{png,pdf,svg}  crops.{png,pdf}
+    {figure,gains,sweep}.{png,pdf,svg}  crops.{png,pdf}
     cells/<scene>/<method>/<seed>/cell.json         written last: with it the cell is complete
                                   trace.jsonl       one line a checkpoint
                                   image.exr         parts mean, variance (of the mean), count
@@ -41,6 +41,10 @@ from olpm_bench.bench.files import (
     write_text,
     writer,
 )
+
+# What a report draws, as far as there is something to draw.
+DRAWN = (*(f"{name}.{suffix}" for name in ("figure", "gains", "sweep") for suffix in ("png", "pdf", "svg")),
+         "sheet.png", "crops.png", "crops.pdf", "report.html")
 
 
 @dataclass

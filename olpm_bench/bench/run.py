@@ -3,9 +3,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -17,10 +17,13 @@ from olpm_bench.bench.files import NewerSchemaError, ResultError, require_inside
 from olpm_bench.bench.lock import LockedError, locked, remove_unfinished, tidy
 from olpm_bench.bench.progress import Bar, is_interrupt, reason
 from olpm_bench.bench.reference_file import Reference, find_reference, read_reference
-from olpm_bench.bench.results import Cell, Results
+from olpm_bench.bench.results import DRAWN, Cell, Results
 from olpm_bench.bench.shard import WHOLE, Shard
 from olpm_bench.transport import camera_paths, headroom
 from olpm_bench.transport.settings import InputError
+
+if TYPE_CHECKING:
+    from olpm_bench.bench.finished import Finished
 
 LARGER = 8                  # references are averaged down by whole factors up to this
 PATIENCE = 2.0              # [s] between looks at what is in other hands
@@ -231,45 +234,47 @@ def report(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> None
     Raises:
         ResultError: a cell or a reference is missing.
     """
-    from olpm_bench.bench import summary
-    from olpm_bench.report import figures, sheet, sweeps
+    from olpm_bench.bench import finished, summary
 
     results = Results(root / experiment.stem)
     missing = Counter(spec.scene.name for spec in experiment.cells() if not is_complete(results, spec)[0]) if only else Counter()
     if missing:
         experiment = experiment.of_scenes(only)
-    found = references(experiment, root)
-    summarised = summary.summarise(experiment, results, found)
+    found = finished.read(experiment, results, references(experiment, root))
+    summarised = summary.summarise(found)
     summary.print_table(summarised)
-    if experiment.budget.seconds is not None and len(cpus := summary.cpus(experiment, results)) > 1:
-        print(f"made on different CPUs, whose seconds do not compare: {', '.join(cpus)}")
+    if experiment.budget.seconds is not None and len(found.machines) > 1:
+        print(f"made on different machines, whose seconds do not compare: {'; '.join(found.machines)}")
     if len(experiment.method) > 1:
-        summary.print_speed_ups(summary.speed_ups(experiment, results, found), experiment.baseline_name)
+        summary.print_speed_ups(found.speed_ups, experiment.baseline_name)
     if missing:
         cells = ", ".join(f"{n} of {scene}" for scene, n in missing.items())
         print(f"no summary and no figures yet; cells missing: {cells}")
         return
-    written = ["summary.json", "table.csv"]
     summary.write(summarised, results)
-    if figures.gains(results, experiment, summarised):
-        written += ["gains.png", "gains.pdf"]
-    if sweeps.sweeps(results, experiment, found):
-        written += ["sweep.png", "sweep.pdf"]
-    if found:
-        figures.curves(results, experiment, found)
-        sheet.sheet(results, experiment, found)
-        written += ["figure.png", "figure.pdf", "sheet.png"]
-    else:
-        print("no figure of L1 and no sheet: no scene has a reference")
-    drawn = [name for name in ("figure", "sweep", "gains") if f"{name}.pdf" in written]
-    try:
-        from olpm_bench.report import crops, page
+    print(f"in {results.folder}: {', '.join(['summary.json', 'table.csv', *_draw(found, summarised['rows'])])}")
 
-        page.page(results, experiment, found, summarised, drawn)
-        written.append("report.html")
-        if found:
-            crops.crops(results, experiment, found)
-            written += ["crops.pdf", "crops.png"]
+
+def _draw(found: Finished, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Draw all figures and the page that there are of an experiment, and remove those of an earlier run that are no more.
+
+    Args:
+        rows: of its summary.
+
+    Returns:
+        The names of the files.
+    """
+    from olpm_bench.report import crops, figures, page, sheet, sweeps
+
+    blocks = sheet.blocks(found)
+    written = figures.gains(found, rows) + sweeps.sweeps(found) + figures.curves(found) + sheet.sheet(found, blocks)
+    if not blocks:
+        print("no figure of L1 and no sheet: no scene has a reference")
+    try:
+        written += page.page(found, rows, blocks, [name for name in page.CAPTIONS if f"{name}.svg" in written])
+        written += crops.crops(found, blocks)
     except ModuleNotFoundError as error:
         print(f"report.html and crops.pdf need {error.name}: pip install 'olpm-bench[report]'")
-    print(f"in {results.folder}: {', '.join(written)}")
+    for name in set(DRAWN).difference(written):
+        (found.results.folder / name).unlink(missing_ok=True)
+    return written

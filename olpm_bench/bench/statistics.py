@@ -64,7 +64,7 @@ def median_band(values: Sequence[float] | np.ndarray) -> Band:
 
 
 def geometric_mean(ratios: Sequence[float] | np.ndarray) -> float:
-    """exp(mean(log)): the mean of speed-ups or error ratios over scenes.
+    """exp(mean(log)): the mean of speed-ups over scenes.
 
     Raises:
         ValueError: no ratio, or one that is not positive and finite.
@@ -210,24 +210,6 @@ def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Inte
     value, bound = ratio(*range(n))
     low, high = end("<", -np.inf).low, end(">", np.inf).high
     return Interval(value, low if np.isfinite(low) else float("nan"), high if np.isfinite(high) else float("nan"), bound)
-
-
-def error_ratio(baseline: Curve, method: Curve, seconds: float | None = None) -> Interval:
-    """Error of the baseline over error of the method at equal time (medians), with a paired bootstrap interval.
-
-    Args:
-        seconds: the time; by default the latest that both curves cover.
-
-    Returns:
-        NaN where one of them does not cover the time.
-    """
-    _paired(baseline, method)
-    at = np.array([min(baseline.times[-1], method.times[-1]) if seconds is None else seconds])
-
-    def ratio(index: np.ndarray) -> float:
-        a, b = (interpolate(c.times, np.median(c.errors[index], axis=0), at)[0] for c in (baseline, method))
-        return float(a / b)
-    return bootstrap(ratio, len(method.errors))
 
 
 def gain(baseline: Work, method: Work) -> Interval:

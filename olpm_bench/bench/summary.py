@@ -7,7 +7,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,14 +15,14 @@ import numpy as np
 from olpm_bench.bench import metrics, statistics
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
-from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Cell, Results
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from olpm_bench.bench.config import Experiment, Scene
+    from olpm_bench.bench.config import Experiment
+    from olpm_bench.bench.finished import Final, Finished
 
 
 def complete_cells(experiment: Experiment, results: Results, any_version: bool = False) -> dict[tuple[str, str], list[Cell]]:
@@ -48,12 +48,6 @@ def complete_cells(experiment: Experiment, results: Results, any_version: bool =
     return cells
 
 
-def cpus(experiment: Experiment, results: Results) -> list[str]:
-    """The models of CPU that the cells were made on, where they say so."""
-    cells = [cell for group in complete_cells(experiment, results).values() for cell in group]
-    return sorted({cell.info["machine"]["cpu"] for cell in cells if "machine" in cell.info})
-
-
 def _agrees(stored: Any, now: Any) -> bool:
     """Whether two configurations have the same values; keys that one version has and another has not do not count."""
     if isinstance(stored, dict) and isinstance(now, dict):
@@ -61,53 +55,16 @@ def _agrees(stored: Any, now: Any) -> bool:
     return bool(stored == now)
 
 
-def scene_reference(references: Mapping[str, Reference], scene: Scene, results: Results,
-                    experiment: Experiment) -> Reference | None:
-    """The reference of a scene; None if the experiment does without.
-
-    Raises:
-        ResultError: there is none; the message names the command that makes it.
-    """
-    if not scene.has_reference:
-        return None
-    if scene.name not in references:
-        raise ResultError(f"scene {scene.name} has no reference; make it with: "
-                          f"{experiment.command('reference', results.folder.parent)}")
-    return references[scene.name]
-
-
-def error_curve(cells: Sequence[Cell], reference: Reference,
-                metric: Callable[[np.ndarray, np.ndarray], float] = metrics.l1,
-                over: str = "seconds") -> statistics.Curve:
-    """Error at the checkpoints of the cells (one per seed) over a column of their traces: charged seconds, or "spp"."""
-    times = [np.array([line[over] for line in cell.trace], np.float64) for cell in cells]
-    errors = [np.array([metric(image, reference.mean) for image in cell.checkpoints()]) for cell in cells]
-    return statistics.common_curve(times, errors)
-
-
-def summarise(experiment: Experiment, results: Results, references: Mapping[str, Reference],
-              any_version: bool = False) -> dict[str, Any]:
+def summarise(finished: Finished) -> dict[str, Any]:
     """The summary of an experiment: ``{"schema_version", "rows"}``, one row a scene and method, in the TOML's order.
 
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
     `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, `invalid_pixels` is the
     sum.  `gain` is the baseline's work-normalised variance over the method's, with its 90 % jackknife interval.  What has no
     value (a spread of one seed, the error of an image with NaN or of a scene without reference) is None.
-
-    Args:
-        references: by the name of the scene; any_version: as for `complete_cells`.
-
-    Raises:
-        ResultError: a cell or reference is missing.
     """
-    cells, rows = complete_cells(experiment, results, any_version), []
-    for scene in experiment.scene:
-        reference = scene_reference(references, scene, results, experiment)
-        images = {method.name: [cell.image()["mean"] for cell in cells[scene.name, method.name]] for method in experiment.method}
-        works = {name: work(cells[scene.name, name], means) for name, means in images.items()}
-        for name, means in images.items():
-            gain = statistics.gain(works[experiment.baseline_name], works[name])
-            rows.append(_row(scene.name, name, cells[scene.name, name], means, reference, gain))
+    rows = [_row(scene.scene.name, method, scene.cells[method], final)
+            for scene in finished.scenes for method, final in scene.final.items()]
     return {"schema_version": SCHEMA_VERSION, "rows": rows}
 
 
@@ -117,19 +74,16 @@ def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work
     return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
 
 
-def _row(scene: str, method: str, cells: Sequence[Cell], images: Sequence[np.ndarray], reference: Reference | None,
-         gain: statistics.Interval) -> dict[str, Any]:
-    errors = {name: [metric(image, reference.mean) if reference is not None else float("nan") for image in images]
-              for name, metric in metrics.METRICS.items()}
+def _row(scene: str, method: str, cells: Sequence[Cell], final: Final) -> dict[str, Any]:
     info = {key: np.array([cell.info[key] for cell in cells], np.float64) for key in (      # null becomes NaN
-        "training_passes", "train_seconds", "render_seconds", "compile_seconds", "charged_seconds", "wait_fraction", "spp",
-        "records", "bytes_per_record", "particles", "invalid_pixels", "mean", "mean_stderr")}
-    l1 = statistics.median_band(errors["l1"])
+        "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
+        "bytes_per_record", "particles", "invalid_pixels", "mean", "mean_stderr")}
+    l1, gain = statistics.median_band(final.errors["l1"]), final.gain
     return plain({
         "scene": scene, "method": method, "seeds": [cell.seed for cell in cells],
         "l1": l1.median, "l1_low": l1.low, "l1_high": l1.high,
-        **{name: np.median(values) for name, values in errors.items()},
-        "work_normalised_variance": metrics.work_normalised_variance(images, float(np.mean(info["charged_seconds"]))),
+        **{name: np.median(values) for name, values in final.errors.items()},
+        "work_normalised_variance": final.work_normalised_variance,
         "gain": gain.value, "gain_low": gain.low, "gain_high": gain.high, "mean": np.mean(info["mean"]),
         "mean_stderr": np.sqrt(np.sum(info["mean_stderr"] ** 2)) / len(cells),      # seeds are independent
         "training_passes": _whole(np.median(info["training_passes"])),
@@ -153,26 +107,6 @@ def write(summary: dict[str, Any], results: Results) -> None:
     table.writeheader()
     table.writerows({**row, "seeds": " ".join(map(str, row["seeds"]))} for row in summary["rows"])
     results.write_text("table.csv", text.getvalue())
-
-
-def speed_ups(experiment: Experiment, results: Results,
-              references: Mapping[str, Reference]) -> dict[str, dict[str, statistics.Interval]]:
-    """Speed-up of each method over the baseline at equal L1: method -> scene -> ratio of charged seconds.
-
-    Scenes without reference are left out.
-    """
-    cells = complete_cells(experiment, results)
-    baseline = experiment.baseline_name
-    others = [method.name for method in experiment.method if method.name != baseline]
-    found: dict[str, dict[str, statistics.Interval]] = {method: {} for method in others}
-    for scene in experiment.scene:
-        reference = scene_reference(references, scene, results, experiment)
-        if reference is None:
-            continue
-        first = error_curve(cells[scene.name, baseline], reference)
-        for method in others:
-            found[method][scene.name] = statistics.speed_up(first, error_curve(cells[scene.name, method], reference))
-    return found
 
 
 def print_table(summary: dict[str, Any], console: Console | None = None) -> None:

@@ -5,20 +5,18 @@ Laid out by figuregen, set by Typst; text and boxes are vectors, pixels are show
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from olpm_bench.bench import summary
-from olpm_bench.bench.files import read_json, replacing
-from olpm_bench.bench.reference_file import Reference
-from olpm_bench.bench.results import Results
+from olpm_bench.bench.files import replacing
 from olpm_bench.report import figures, sheet, tonemap
 
 if TYPE_CHECKING:
-    from olpm_bench.bench.config import Experiment
+    from olpm_bench.bench.finished import Finished
 
 WIDTH = 178.0                   # of two columns of a paper [mm]
 DPI = 300                       # of the PNG
@@ -34,19 +32,20 @@ PAGE = """#set page(width: auto, height: auto, margin: 1mm)
 NOTE = '#v(1mm, weak: true)#block(width: {width}mm, text(size: 6.5pt, fill: rgb("#555555"), "{note}"))\n'
 
 
-def crops(results: Results, experiment: Experiment, references: Mapping[str, Reference], out: Path | None = None) -> None:
-    """Write crops.pdf and crops.png into `out` (the results folder by default).
+def crops(found: Finished, blocks: Sequence[sheet.Block]) -> list[str]:
+    """Write crops.pdf and crops.png into the results folder, if there is something to show; return their names.
 
     Raises:
         ImportError: figuregen or Typst is not installed.
-        ResultError: as `sheet.blocks`.
     """
-    note = sheet.caption(experiment, read_json(results.folder / "env.json"))
-    draw(sheet.blocks(results, experiment, references), note, out or results.folder)
+    if not blocks:
+        return []
+    draw(blocks, sheet.caption(found), found.results.folder)
+    return ["crops.pdf", "crops.png"]
 
 
 def draw(blocks: Sequence[sheet.Block], note: str, folder: Path) -> None:
-    """As `crops`: one row a scene, `note` below."""
+    """Write crops.pdf and crops.png into `folder`: one row a scene, `note` below."""
     import matplotlib
     import typst
 
@@ -97,7 +96,7 @@ def _grids(block: sheet.Block, title: str) -> list[Any]:
             insets[row, column].image = _png(image[y:y + height, x:x + width], block.exposure)
             insets[row, column].set_frame(STROKE, colour)
     errors = [NEW_LINE.join((f"L1 {summary.number(l1)}", f"relMSE {summary.number(relmse)}"))
-              for l1, relmse in sheet.errors_of(block).values()]
+              for l1, relmse in block.errors.values()]
     noise = "" if block.floor is None else NEW_LINE.join(("noise floor", summary.number(block.floor)))
     for grid, above, below in ((whole, [title], [""]), (insets, list(images), [noise, *errors])):
         for side, texts, lines in (("north", above, 1), ("south", below, 2)):

@@ -1,10 +1,9 @@
 """The convergence figure, L1 error over charged seconds, one panel a scene; and the gains in variance with their intervals.
 
-Reads results, renders nothing.  Colour, marker and dash belong to a method by its place in the TOML.
+Reads results, renders nothing.  Colour, marker and dash belong to a method in all figures: `Experiment.looks`.
 """
 from __future__ import annotations
 
-import itertools
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -15,16 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import statistics, summary
-from olpm_bench.bench.files import read_json, replacing
-from olpm_bench.bench.reference_file import Reference
-from olpm_bench.bench.results import Cell, Results
+from olpm_bench.bench import statistics
+from olpm_bench.bench.files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from olpm_bench.bench.config import Experiment
+    from olpm_bench.bench.finished import Finished, FinishedScene
 
 STYLE = Path(__file__).with_name("olpm_bench.mplstyle")
 GREY = "#8a8a8a"
@@ -42,16 +40,17 @@ class Panel:
     """What one panel shows.
 
     curves: method -> error of every seed over the abscissa.
-    training: method -> where its training ends on the abscissa; methods without training are left out.
+    looks: method -> number of its colour, marker and dash, as `Experiment.looks`.
+    training: method -> where its training ends on the abscissa; left out where there is none, or older cells do not say.
     budget: where the cells were to stop, None if that is elsewhere for each.
     floor: noise floor of the reference, mean |A - B| / 2; 0 if unknown.
     speed_ups: method -> how much faster than the baseline it is at equal error.
     abscissa, ordinate: labels of the axes; numbers: of the ticks of the abscissa.
     slope: show the rate of Monte Carlo.
-    looks: names in the order of colours, markers and dashes, where panels have not the same curves.
     """
     title: str
     curves: dict[str, statistics.Curve]
+    looks: Mapping[str, int]
     training: dict[str, float]
     budget: float | None
     floor: float
@@ -60,81 +59,67 @@ class Panel:
     ordinate: str = "L1 error"
     numbers: Callable[[float], str] | None = None       # `tick_label`
     slope: bool = True
-    looks: tuple[str, ...] = ()
 
 
-def curves(results: Results, experiment: Experiment, references: Mapping[str, Reference],
-           out: Path | None = None) -> None:
-    """Write figure.png and figure.pdf into `out` (the results folder by default).
+def curves(found: Finished) -> list[str]:
+    """Write figure.png, figure.pdf and figure.svg into the results folder, if some scene has a reference; return their names.
 
-    A panel a scene over charged seconds, and for a budget in samples another over samples per pixel.  Scenes without reference
-    are left out; there must be another.
-
-    Raises:
-        ResultError: a cell or reference is missing; the message names the command that makes it.
+    A panel a scene over charged seconds, and for a budget in samples another over samples per pixel.
     """
+    experiment = found.experiment
     axes = ["seconds"] if experiment.budget.spp is None else ["spp", "seconds"]
-    cells = summary.complete_cells(experiment, results)
-    panels = []
-    for scene in experiment.scene:
-        reference = summary.scene_reference(references, scene, results, experiment)
-        if reference is None:
-            continue
-        methods = {method.name: cells[scene.name, method.name] for method in experiment.shown}
-        title = scene.name if len(experiment.scene) * len(axes) > 1 else experiment.title
-        panels += [_panel(title, methods, reference, over, experiment) for over in axes]
+    several = len(experiment.scene) * len(axes) > 1
+    panels = [_panel(scene.scene.name if several else experiment.title, scene, over, experiment)
+              for scene in found.compared for over in axes]
+    if not panels:
+        return []
     faint = any((curve.median < NEAR_FLOOR * panel.floor).any() for panel in panels for curve in panel.curves.values())
-    note = caption(experiment, read_json(results.folder / "env.json"), faint)
     with style():
-        figure = draw(panels, experiment.title if len(panels) > 1 else "", note)
-        save(figure, out or results.folder, "figure")
+        figure = draw(panels, experiment.title if len(panels) > 1 else "",
+                      caption(found, any(panel.training for panel in panels), faint))
+        return save(figure, found.results.folder, "figure")
 
 
-def _panel(title: str, methods: Mapping[str, Sequence[Cell]], reference: Reference, over: str, experiment: Experiment) -> Panel:
-    found = {method: summary.error_curve(cells, reference, over=over) for method, cells in methods.items()}
-    floor = reference.noise_floor or 0.0
+def _panel(title: str, scene: FinishedScene, over: str, experiment: Experiment) -> Panel:
+    assert scene.reference is not None
+    shown, curves, floor = [method.name for method in experiment.shown], scene.curves(over), scene.reference.noise_floor or 0.0
+    curves = {name: curves[name] for name in shown}
     if over == "spp":
-        return Panel(title, found, {}, float(experiment.budget.spp or 0), floor, abscissa="samples per pixel")
-    trained = {method: float(np.median([cell.trace[0]["train_seconds"] for cell in cells])) for method, cells in methods.items()}
-    baseline = found.get(experiment.baseline_name)
-    return Panel(title, found, {method: t for method, t in trained.items() if t > 0},
-                 experiment.budget.seconds, floor,
-                 {method: statistics.speed_up(baseline, curve) for method, curve in found.items()
-                  if baseline is not None and curve is not baseline})
+        return Panel(title, curves, experiment.looks, {}, float(experiment.budget.spp or 0), floor, abscissa="samples per pixel")
+    ended: dict[str, list[Any]] = {name: [cell.info.get("training_ended") for cell in scene.cells[name]] for name in shown}
+    return Panel(title, curves, experiment.looks,
+                 {name: float(np.median(times)) for name, times in ended.items() if None not in times},
+                 experiment.budget.seconds, floor, {name: scene.speed_ups[name] for name in shown if name in scene.speed_ups})
 
 
-def gains(results: Results, experiment: Experiment, summarised: Mapping[str, Any], out: Path | None = None) -> bool:
-    """Write gains.png and gains.pdf into `out` (the results folder by default), unless there is one method or seed only.
+def gains(found: Finished, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Write gains.png, gains.pdf and gains.svg into the results folder, unless there is one method or seed only; return their
+    names.
 
     Args:
-        summarised: by `summary.summarise`.
-
-    Returns:
-        Whether there was something to draw.
+        rows: of the summary.
     """
-    rows = [row for row in summarised["rows"] if row["method"] != experiment.baseline_name]
+    experiment = found.experiment
+    rows = [row for row in rows if row["method"] != experiment.baseline_name]
     if not any(row["gain"] is not None for row in rows):
-        return False
-    n, machine_ = len(experiment.seeds), machine(read_json(results.folder / "env.json"))
+        return []
+    n = len(experiment.seeds)
     spread = f"90 % jackknife intervals over {n} paired seeds." if n > 2 else f"{n} seeds."
     with style():
-        figure = draw_gains(rows, [method.name for method in experiment.method], experiment.baseline_name, experiment.title,
-                            f"Relative variance of a pixel (median) times charged seconds. {spread} {machine_}")
-        save(figure, out or results.folder, "gains")
-    return True
+        figure = draw_gains(rows, experiment.looks, experiment.baseline_name, experiment.title,
+                            f"Relative variance of a pixel (median) times charged seconds. {spread} {machines(found)}")
+        return save(figure, found.results.folder, "gains")
 
 
-def draw_gains(rows: Sequence[Mapping[str, Any]], methods: Sequence[str], baseline: str, title: str = "",
+def draw_gains(rows: Sequence[Mapping[str, Any]], looks: Mapping[str, int], baseline: str, title: str = "",
                note: str = "") -> Figure:
     """The gains, in the style that is active.
 
     Args:
-        rows: of the summary, without the baseline's, scene by scene; methods: all names, in the order of the TOML.
+        rows: of the summary, without the baseline's, scene by scene; looks: as of a `Panel`.
     """
-    from matplotlib import rcParams
     from matplotlib.figure import Figure
 
-    styles = dict(zip(methods, itertools.cycle(rcParams["axes.prop_cycle"]), strict=False))
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     lines: list[Mapping[str, Any] | str] = []       # from the top: a scene's name above its rows
     for scene in scenes:
@@ -162,7 +147,7 @@ def draw_gains(rows: Sequence[Mapping[str, Any]], methods: Sequence[str], baseli
         if isinstance(row, str):
             axes.text(-(left - 0.1) / PANEL[0], y, row, transform=axes.get_yaxis_transform(), va="center_baseline", fontsize=8.5)
             continue
-        look = styles[row["method"]]
+        look = _look(looks[row["method"]])
         axes.text(-0.1 / PANEL[0], y, row["method"], color=look["color"], ha="right", transform=axes.get_yaxis_transform(),
                   va="center_baseline")
         axes.text(1 + 0.1 / PANEL[0], y, numbers[y], transform=axes.get_yaxis_transform(), va="center_baseline", fontsize=7.5)
@@ -195,30 +180,41 @@ def style() -> AbstractContextManager[None]:
     return matplotlib.style.context(STYLE)
 
 
-def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write name.png, name.pdf and name.svg."""
-    for suffix, metadata in ((".png", None), (".pdf", {"CreationDate": None}), (".svg", {"Date": None})):
-        with replacing(folder / (name + suffix)) as beside:
-            figure.savefig(beside, metadata=metadata)
+def _look(number: int) -> dict[str, Any]:
+    """Colour, marker and dash, in the style that is active."""
+    from matplotlib import rcParams
+
+    cycle = list(rcParams["axes.prop_cycle"])
+    return dict(cycle[number % len(cycle)])
 
 
-def caption(experiment: Experiment, environment: Mapping[str, Any], faint: bool = False) -> str:
-    """What every figure must say: seeds, spread, whether training counts, and the machine.
+def save(figure: Figure, folder: Path, name: str) -> list[str]:
+    """Write name.png, name.pdf and name.svg; return these names."""
+    metadata: dict[str, Any] = {"png": None, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
+    for suffix, data in metadata.items():
+        with replacing(folder / f"{name}.{suffix}") as beside:
+            figure.savefig(beside, metadata=data)
+    return [f"{name}.{suffix}" for suffix in metadata]
+
+
+def caption(found: Finished, trained: bool = False, faint: bool = False) -> str:
+    """What every figure must say: seeds, spread, whether training counts, and the machines.
 
     Args:
-        faint: some curve comes near the noise floor.
+        trained: the end of some method's training is marked; faint: some curve comes near the noise floor.
     """
+    experiment = found.experiment
     n = len(experiment.seeds)
     seeds = f"Median and 5\N{EN DASH}95 % band of {n} seeds." if n > 1 else "One seed."
+    training = " Triangles mark the end of training." if trained else ""
     faster = f" {TIMES}: times as fast as {experiment.baseline_name} to an equal error, 90 % interval."
     near = f" Faint: below {NEAR_FLOOR:g} times the noise of the reference." if faint else ""
-    times = f" Triangles mark the end of training.{faster if len(experiment.shown) > 1 else ''}"
-    return f"{seeds}{times}{near} {machine(environment)}"
+    return f"{seeds}{training}{faster if len(experiment.shown) > 1 else ''}{near} {machines(found)}"
 
 
-def machine(environment: Mapping[str, Any]) -> str:
-    """The machine, as env.json describes it."""
-    return f"{environment['cpu']}, {environment['threads']} threads."
+def machines(found: Finished) -> str:
+    """The machines that made the cells, as a sentence."""
+    return f"{'; '.join(found.machines)}."
 
 
 def draw(panels: Sequence[Panel], title: str = "", note: str = "") -> Figure:
@@ -279,10 +275,7 @@ def text_width(text: str, size: float) -> float:
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:
-    from matplotlib import rcParams
-
-    looks = dict(zip(panel.looks or panel.curves, rcParams["axes.prop_cycle"](), strict=False))
-    styles = {method: looks[method] for method in panel.curves}
+    styles = {method: _look(panel.looks[method]) for method in panel.curves}
     axes.set_title(panel.title)
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -366,10 +359,20 @@ def _draw_floor(axes: Axes, panel: Panel) -> None:
     if lowest < panel.floor:            # a poor reference: the curves are below its line
         _note(axes, "noise of the reference", (0, panel.floor), (4, 2), ha="left", va="bottom")
     elif panel.floor >= low:
-        _note(axes, "noise of the reference", (1, panel.floor), (-2, -2), ha="right", va="top")
+        _note_at_a_side(axes, "noise of the reference", panel, panel.floor, -2, "right", va="top")
     elif panel.floor > 0:
         text = f"noise of the reference: {tick_label(float(f'{panel.floor:.2g}'))} \N{DOWNWARDS ARROW}"
-        _note(axes, text, (0, low), (4, 2), ha="left", va="bottom")      # training's triangles are further right
+        _note_at_a_side(axes, text, panel, low, 2, "left", va="bottom")
+
+
+def _note_at_a_side(axes: Axes, text: str, panel: Panel, y: float, offset: float, wanted: str, va: str) -> None:
+    """A note at the left or right end of the axis, the wanted one unless only the other is clear of the triangles of training."""
+    low, high = np.log(axes.get_xlim())
+    ends = [(math.log(time) - low) / (high - low) for time in panel.training.values()]
+    room = 0.06 + text_width(text, 6.5) / PANEL[0]
+    clear = {"left": all(end > room for end in ends), "right": all(end < 1 - room for end in ends)}
+    side = wanted if clear[wanted] or not any(clear.values()) else "left" if wanted == "right" else "right"
+    _note(axes, text, (0, y) if side == "left" else (1, y), (4 if side == "left" else -2, offset), ha=side, va=va)
 
 
 def _note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **alignment: Any) -> None:

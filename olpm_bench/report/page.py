@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from olpm_bench.bench import summary
-from olpm_bench.bench.files import read_json, write_text
-from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.files import read_json
 from olpm_bench.bench.results import Results
 from olpm_bench.report import sheet, tonemap
 
 if TYPE_CHECKING:
-    from olpm_bench.bench.config import Experiment, Scene
+    from olpm_bench.bench.config import Experiment
+    from olpm_bench.bench.finished import Finished, FinishedScene
 
 TEMPLATE = "page.html.jinja"
 LARGEST = 12e6                          # bytes of all images; base64 makes 16 MB of them
@@ -53,34 +53,33 @@ class Picture(NamedTuple):
     is_error: bool = False              # shown in false colours
 
 
-def page(results: Results, experiment: Experiment, references: Mapping[str, Reference], summarised: Mapping[str, Any],
-         figures: Sequence[str], out: Path | None = None) -> None:
-    """Write report.html into `out` (the results folder by default).
+def page(found: Finished, rows: Sequence[Mapping[str, Any]], blocks: Sequence[sheet.Block], figures: Sequence[str]) -> list[str]:
+    """Write report.html into the results folder; return its name.
 
     Args:
-        summarised: by `summary.summarise`.
+        rows: of the summary; blocks: by `sheet.blocks`.
         figures: names of those in the results folder, as `figures.save` writes them.
 
     Raises:
         ImportError: Jinja or SimpleImageIO is not installed.
-        ResultError: a cell or reference is missing; the message names the command that makes it.
     """
     import jinja2
     import simpleimageio
 
-    found = summary.speed_ups(experiment, results, references)
+    experiment, results = found.experiment, found.results
     environment = jinja2.Environment(loader=jinja2.PackageLoader("olpm_bench", "report"), autoescape=True, trim_blocks=True,
                                      lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     text = environment.get_template(TEMPLATE).render(
         experiment=experiment, budget=sheet.budget(experiment), commands=commands(experiment, results),
-        command=commands(experiment, results)[-1],
-        viewers=viewers(results, experiment, references), headers=HEADERS, rows=table(summarised["rows"]),
-        speed_ups=summary.speed_up_lines(found, experiment.baseline_name),
+        command=commands(experiment, results)[-1], machines="; ".join(found.machines),
+        viewers=viewers(found, blocks), headers=HEADERS, rows=table(rows),
+        speed_ups=summary.speed_up_lines(found.speed_ups, experiment.baseline_name),
         figures=[{"name": name, "svg": svg(results.folder / f"{name}.svg", CAPTIONS[name]), "caption": CAPTIONS[name]}
                  for name in figures],
         configuration=experiment.toml(results.folder), machine=machine(read_json(results.folder / "env.json")),
         viewer=simpleimageio.make_header(), licence=licence())
-    write_text((out or results.folder) / "report.html", text)
+    results.write_text("report.html", text)
+    return ["report.html"]
 
 
 def commands(experiment: Experiment, results: Results) -> list[str]:
@@ -91,9 +90,10 @@ def commands(experiment: Experiment, results: Results) -> list[str]:
 
 # ---------------------------------------------------------------- images
 
-def viewers(results: Results, experiment: Experiment, references: Mapping[str, Reference]) -> list[dict[str, Any]]:
+def viewers(found: Finished, blocks: Sequence[sheet.Block]) -> list[dict[str, Any]]:
     """For each scene its name, a caption, and what the viewer is told."""
-    groups = [pictures(results, experiment, scene, references) for scene in experiment.scene]
+    experiment, shown_of = found.experiment, {block.scene: block for block in blocks}
+    groups = [pictures(found, scene, shown_of.get(scene.scene.name)) for scene in found.scenes]
     pixels = sum(picture.image[..., 0].size for group in groups for picture in group)
     # The first that is small enough: float32, shared exponents, these averaged over 2 x 2 pixels, over 3 x 3, ...
     forms = itertools.chain([(1, "single")], ((k, "rgbe") for k in itertools.count(1)))
@@ -108,17 +108,13 @@ def viewers(results: Results, experiment: Experiment, references: Mapping[str, R
     return shown
 
 
-def pictures(results: Results, experiment: Experiment, scene: Scene, references: Mapping[str, Reference]) -> list[Picture]:
+def pictures(found: Finished, scene: FinishedScene, block: sheet.Block | None) -> list[Picture]:
     """Reference, methods and their error maps; without reference the first seed of each method."""
-    alone = experiment.of_scenes([scene.name])
-    blocks = sheet.blocks(results, alone, references)
-    if not blocks:
-        cells = summary.complete_cells(alone, results)
-        return [Picture(method.name, cells[scene.name, method.name][0].image()["mean"]) for method in alone.shown]
-    reference, images = blocks[0].reference, blocks[0].images
-    errors = [Picture(f"error of {method}", np.repeat(sheet.relative_error(image, reference)[..., None], 3, axis=-1), True)
-              for method, image in images.items()]
-    return [Picture("Reference", reference), *itertools.starmap(Picture, images.items()), *errors]
+    if block is None:
+        return [Picture(method.name, scene.cells[method.name][0].image()["mean"]) for method in found.experiment.shown]
+    errors = [Picture(f"error of {method}", np.repeat(error[..., None], 3, axis=-1), True)
+              for method, error in block.error_maps.items()]
+    return [Picture("Reference", block.reference), *itertools.starmap(Picture, block.images.items()), *errors]
 
 
 def flip_book(element: str, group: Sequence[Picture], kind: str) -> dict[str, Any]:

@@ -6,18 +6,16 @@ where an image is too wide for its column.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from olpm_bench.bench import metrics, summary
-from olpm_bench.bench.files import read_json, replacing
-from olpm_bench.bench.reference_file import Reference
-from olpm_bench.bench.results import Results
+from olpm_bench.bench.files import replacing
 from olpm_bench.report import figures, tonemap
 
 if TYPE_CHECKING:
@@ -25,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from olpm_bench.bench.config import Experiment
+    from olpm_bench.bench.finished import Finished
 
 COLUMN = 480                            # wanted width of a column [pixel]
 GAP = 10
@@ -45,6 +44,17 @@ class Block:
     given: Sequence[Crop] = ()          # crops that the experiment's file asks for
 
     @cached_property
+    def errors(self) -> dict[str, tuple[float, float]]:
+        """Method -> L1 and relMSE of its image."""
+        return {name: (metrics.l1(image, self.reference), metrics.relmse(image, self.reference))
+                for name, image in self.images.items()}
+
+    @cached_property
+    def error_maps(self) -> dict[str, np.ndarray]:
+        """Method -> `relative_error` of its image."""
+        return {name: relative_error(image, self.reference) for name, image in self.images.items()}
+
+    @cached_property
     def exposure(self) -> float:
         """Of the reference, for all images."""
         return tonemap.auto_exposure(self.reference)
@@ -60,49 +70,36 @@ class Block:
         return [(x, y, width, height) for x, y in found]
 
 
-def sheet(results: Results, experiment: Experiment, references: Mapping[str, Reference],
-          out: Path | None = None) -> None:
-    """Write sheet.png into `out` (the results folder by default).
-
-    Raises:
-        ResultError: as `blocks`.
-    """
+def sheet(found: Finished, blocks: Sequence[Block]) -> list[str]:
+    """Write sheet.png into the results folder, if there is something to show; return its name."""
+    if not blocks:
+        return []
     with figures.style():
-        figure = draw(blocks(results, experiment, references), caption(experiment, read_json(results.folder / "env.json")))
-        with replacing((out or results.folder) / "sheet.png") as beside:
+        figure = draw(blocks, caption(found))
+        with replacing(found.results.folder / "sheet.png") as beside:
             figure.savefig(beside, dpi=DPI)
+    return ["sheet.png"]
 
 
-def blocks(results: Results, experiment: Experiment, references: Mapping[str, Reference]) -> list[Block]:
-    """What the figures show of each scene: of each method the seed with the median L1.
-
-    Scenes without reference are left out; there must be another.
-
-    Raises:
-        ResultError: a cell or reference is missing; the message names the command that makes it.
-    """
-    cells = summary.complete_cells(experiment, results)
-    found = []
-    for scene in experiment.scene:
-        reference = summary.scene_reference(references, scene, results, experiment)
-        if reference is None:
-            continue
-        images = {}
-        for method in (method.name for method in experiment.shown):
-            images[method] = _median_image([cell.image()["mean"] for cell in cells[scene.name, method]], reference.mean)
-        found.append(Block(scene.name, reference.mean, reference.noise_floor, images, scene.crops))
-    return found
+def blocks(found: Finished) -> list[Block]:
+    """What the figures show of each scene with a reference: of each method the seed with the median L1."""
+    shown = []
+    for scene in found.compared:
+        assert scene.reference is not None
+        images = {method.name: scene.cells[method.name][median_seed(scene.final[method.name].errors["l1"])].image()["mean"]
+                  for method in found.experiment.shown}
+        shown.append(Block(scene.scene.name, scene.reference.mean, scene.reference.noise_floor, images, scene.scene.crops))
+    return shown
 
 
-def _median_image(images: Sequence[np.ndarray], reference: np.ndarray) -> np.ndarray:
-    """The image with the median L1 (the lower one of two)."""
-    order = np.argsort([metrics.l1(image, reference) for image in images])
-    return images[order[(len(images) - 1) // 2]]
+def median_seed(errors: np.ndarray) -> int:
+    """Which of the errors is the median (the lower one of two)."""
+    return int(np.argsort(errors)[(len(errors) - 1) // 2])
 
 
-def caption(experiment: Experiment, environment: Mapping[str, Any]) -> str:
-    """What every picture of images must say: budget, seeds, and the machine."""
-    return f"{experiment.title}: {shown(experiment)}. {figures.machine(environment)}"
+def caption(found: Finished) -> str:
+    """What every picture of images must say: budget, seeds, and the machines."""
+    return f"{found.experiment.title}: {shown(found.experiment)}. {figures.machines(found)}"
 
 
 def shown(experiment: Experiment, has_reference: bool = True) -> str:
@@ -121,12 +118,6 @@ def budget(experiment: Experiment) -> str:
 def relative_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """|x - r| / (r + 0.01), mean over channels: (h, w)."""
     return np.asarray(np.mean(np.abs(image - reference) / (reference + metrics.EPSILON), axis=-1, dtype=np.float64))
-
-
-def errors_of(block: Block) -> dict[str, tuple[float, float]]:
-    """Method -> L1 and relMSE of the image that is shown."""
-    return {name: (metrics.l1(image, block.reference), metrics.relmse(image, block.reference))
-            for name, image in block.images.items()}
 
 
 def error_scale(errors: Sequence[np.ndarray]) -> float:
@@ -198,10 +189,12 @@ def draw(blocks: Sequence[Block], note: str = "") -> Figure:
     crop_heights = [max(len(inset) for inset in _insets(block.reference, block.crops, width))
                     for block, (_, width, _) in zip(blocks, sizes, strict=True)]
     left = GAP + (round(1.5 * text) if len(blocks) > 1 else 0)
-    head, foot = round(1.9 * text), round(1.6 * text) if note else GAP
+    head = round(1.9 * text)
     caption_row = round(1.65 * text)
     block_heights = [2 * h + crop + caption_row + 2 * GAP for (h, _, _), crop in zip(sizes, crop_heights, strict=True)]
     width = left + (1 + len(blocks[0].images)) * (column + GAP)
+    lines = _wrapped(note, 0.95 * (width - left - GAP), 0.75 * text)
+    foot = round((0.85 + 0.75 * len(lines)) * text) if lines else GAP
     height = head + sum(block_heights) + 2 * GAP * (len(blocks) - 1) + foot
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
@@ -215,9 +208,15 @@ def draw(blocks: Sequence[Block], note: str = "") -> Figure:
             _text(axes, GAP + 0.6 * text, y + block_height / 2, block.scene, 1.15 * text, rotation=90)
         _draw_block(axes, block, [x + (column - shown_width) // 2 for x in columns], y, text, caption_row)
         y += block_height + 2 * GAP
-    if note:
-        _text(axes, columns[0], height - foot / 2, note, 0.75 * text, ha="left", color="#555555")
+    _text(axes, columns[0], height - foot / 2, "\n".join(lines), 0.75 * text, ha="left", color="#555555", linespacing=1.0)
     return figure
+
+
+def _wrapped(note: str, width: float, size: float) -> list[str]:
+    """The lines of a note of this width and size of letters [pixel]."""
+    if not note:
+        return []
+    return textwrap.wrap(note, int(len(note) * width / (DPI * figures.text_width(note, size * 72 / DPI))))
 
 
 def _crop_size(reference: np.ndarray) -> tuple[int, int]:
@@ -241,11 +240,9 @@ def _draw_block(axes: Axes, block: Block, columns: Sequence[int], top: int, text
 
     height, width, _ = resize(block.reference).shape
     magnified = width / block.reference.shape[1]
-    errors = {name: relative_error(image, block.reference) for name, image in block.images.items()}
-    scale = error_scale(list(errors.values()))
+    scale = error_scale(list(block.error_maps.values()))
     colours = matplotlib.colormaps[COLOUR_MAP].with_extremes(bad="#" + bytes(tonemap.INVALID).hex())
-    under = errors_of(block)
-    best = np.nanmin([[*pair] for pair in under.values()], axis=0)
+    best = np.nanmin(list(block.errors.values()), axis=0)
     error_top = top + height + caption_row
     crop_top = error_top + height + GAP
     for x, (name, image) in zip(columns, {"": block.reference, **block.images}.items(), strict=True):
@@ -262,10 +259,10 @@ def _draw_block(axes: Axes, block: Block, columns: Sequence[int], top: int, text
             at += inset.shape[1] + room // max(1, len(insets) - 1)
         middle = top + height + caption_row / 2
         if name:
-            _image(axes, x, error_top, colours(resize(errors[name]) / scale)[..., :3])
-            for label, value, lowest, share in zip(("L1", "relMSE"), under[name], best, (0.25, 0.72), strict=True):
+            _image(axes, x, error_top, colours(resize(block.error_maps[name]) / scale)[..., :3])
+            for label, value, lowest, share in zip(("L1", "relMSE"), block.errors[name], best, (0.25, 0.72), strict=True):
                 _text(axes, x + share * width, middle, f"{label} {summary.number(value)}", text,
-                      weight="bold" if value == lowest and len(under) > 1 else "normal")
+                      weight="bold" if value == lowest and len(block.errors) > 1 else "normal")
         else:
             if block.floor is not None:
                 _text(axes, x + width / 2, middle, f"noise floor {summary.number(block.floor)}", text, color="#555555")

@@ -4,102 +4,106 @@ Reads results, renders nothing.  Methods without a sweep are level lines.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from olpm_bench.bench import metrics, statistics, summary
-from olpm_bench.bench.config import Experiment, Method
-from olpm_bench.bench.files import read_json
-from olpm_bench.bench.reference_file import Reference
-from olpm_bench.bench.results import Cell, Results
+from olpm_bench.bench import statistics
+from olpm_bench.bench.config import Experiment, Method, Series
+from olpm_bench.bench.finished import Finished, FinishedScene
+from olpm_bench.bench.results import Cell
 from olpm_bench.bench.sweep import short
-from olpm_bench.report import figures
+from olpm_bench.report import figures, sheet
 
 PARTICLE_BYTES = 48         # position, direction, normal, weight and distance as `transport.particles` stores them
 
 LABELS = {"l1": "L1 error", "relmse": "relMSE", "bytes": "memory of learning [MB]", "train_seconds": "training [s]"}
-ERRORS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {"l1": metrics.l1, "relmse": metrics.relmse}
+ERRORS = ("l1", "relmse")
 
 
-def sweeps(results: Results, experiment: Experiment, references: Mapping[str, Reference], out: Path | None = None) -> bool:
-    """Write sweep.png and sweep.pdf into `out` (the results folder by default), if some method sweeps a setting.
+def sweeps(found: Finished) -> list[str]:
+    """Write sweep.png, sweep.pdf and sweep.svg into the results folder, if some method sweeps a setting; return their names.
 
     Errors are left out of scenes without reference.
-
-    Returns:
-        Whether there was something to draw.
-
-    Raises:
-        ResultError: a cell or reference is missing; the message names the command that makes it.
     """
+    experiment = found.experiment
     if not any(method.series for method in experiment.method):
-        return False
-    cells = summary.complete_cells(experiment, results)
-    names = tuple(dict.fromkeys(_series(method) for method in experiment.method))
+        return []
     panels = []
-    for scene in experiment.scene:
-        reference = summary.scene_reference(references, scene, results, experiment)
+    for scene in found.scenes:
         for quantity in experiment.sweep.y:
-            if reference is None and quantity in ERRORS:
+            if scene.reference is None and quantity in ERRORS:
                 continue
-            curves = _curves(experiment, {m.name: cells[scene.name, m.name] for m in experiment.method}, quantity, reference)
-            if curves:
-                floor = reference.noise_floor if reference is not None and quantity == "l1" else None
+            if curves := _curves(experiment, scene, quantity):
+                floor = scene.reference.noise_floor if scene.reference is not None and quantity == "l1" else None
                 panels.append(figures.Panel(
-                    title=scene.name if len(experiment.scene) > 1 else "", curves=curves, training={},
-                    budget=max(float(curve.times[-1]) for curve in curves.values()), floor=floor or 0.0,
-                    abscissa=_abscissa(experiment), ordinate=LABELS[quantity], numbers=short, slope=False, looks=names))
+                    title=scene.scene.name if len(experiment.scene) > 1 else "", curves=curves, looks=experiment.looks,
+                    training={}, budget=max(float(curve.times[-1]) for curve in curves.values()), floor=floor or 0.0,
+                    abscissa=_abscissa(experiment), ordinate=LABELS[quantity], numbers=short, slope=False))
     if not panels:
-        return False
+        return []
     with figures.style():
-        figure = figures.draw(panels, experiment.title, _caption(experiment, results))
-        figures.save(figure, out or results.folder, "sweep")
-    return True
+        return figures.save(figures.draw(panels, experiment.title, _caption(found)), found.results.folder, "sweep")
 
 
-def _curves(experiment: Experiment, cells: Mapping[str, Sequence[Cell]], quantity: str,
-            reference: Reference | None) -> dict[str, statistics.Curve]:
-    """Series -> the quantity of every seed over the abscissa; what is zero has no place on a logarithmic axis."""
+def _curves(experiment: Experiment, scene: FinishedScene, quantity: str) -> dict[str, statistics.Curve]:
+    """Method or sweep -> the quantity of every seed over the abscissa; what is zero has no place on a logarithmic axis."""
     points: dict[str, list[tuple[float, list[float]]]] = {}
     for method in experiment.method:
-        group = cells[method.name]
-        points.setdefault(_series(method), []).append((_position(experiment, method, group),
-                                                       [_value(cell, quantity, reference) for cell in group]))
-    swept = [x for series in points.values() for x, _ in series if x > 0]
+        if method.series is not None and (x := _position(experiment, method, method.series, scene)) > 0:
+            points.setdefault(method.series.name, []).append((x, _values(scene, method.name, quantity)))
+    swept = {x for series in points.values() for x, _ in series}
+    level = {method.name: [(x, _values(scene, method.name, quantity)) for x in {min(swept), max(swept)}]
+             for method in experiment.method if method.series is None and swept}
     curves = {}
-    for name, series in points.items():
-        ordered = sorted(series)
-        if ordered[0][0] == 0:          # no sweep: level
-            ordered = [(x, ordered[0][1]) for x in sorted({min(swept), max(swept)})]
-        x, y = np.array([x for x, _ in ordered]), np.array([y for _, y in ordered]).T
-        if (y > 0).all():
-            curves[name] = statistics.Curve(x, y)
+    for name, series in (level | points).items():
+        series = sorted(series)
+        values = np.array([values for _, values in series]).T
+        if (values > 0).all():
+            curves[name] = statistics.Curve(np.array([x for x, _ in series]), values)
     return curves
 
 
-def _series(method: Method) -> str:
-    return method.series.name if method.series else method.name
-
-
-def _position(experiment: Experiment, method: Method, cells: Sequence[Cell]) -> float:
-    """Where a method is on the abscissa; 0 if it belongs to no series."""
-    if method.series is None:
-        return 0.0
+def _position(experiment: Experiment, method: Method, series: Series, scene: FinishedScene) -> float:
+    """Where a method of a sweep is on the abscissa; counts are those done, of which a budget in seconds may cut some off."""
     if experiment.sweep.x == "photons":
-        return float(np.median([sum(done["photons"] for done in cell.info["passes"]) for cell in cells]))
-    return method.series.value
+        return _median(scene, method, lambda passes: sum(p["photons"] for p in passes))
+    if series.setting == "training.passes" and (training := experiment.training_of(method)) is not None:
+        # By photons, for the passes of a single batch are one, and those of importons that go first are none.
+        return _median(scene, method, lambda passes: sum(p["photons"] for p in passes) / training.photons)
+    if series.setting == "training.camera_passes":          # later ones belong to rendering
+        return _median(scene, method, lambda passes: sum(p["spp"] > 0 and p["index"] < p["passes"] for p in passes))
+    return series.value
 
 
-def _value(cell: Cell, quantity: str, reference: Reference | None) -> float:
+def _median(scene: FinishedScene, method: Method, count: Callable[[list[dict[str, Any]]], float]) -> float:
+    """Median over seeds of what is counted in the training passes of a cell."""
+    return float(np.median([count(cell.info["passes"]) for cell in scene.cells[method.name]]))
+
+
+def _cut_short(found: Finished) -> list[str]:
+    """The methods of sweeps that did less than their setting asked for, and how much that is."""
+    experiment = found.experiment
+    if experiment.sweep.x == "photons":
+        return []
+    where = {scene.scene.name: f" in {scene.scene.name}" if len(found.scenes) > 1 else "" for scene in found.scenes}
+    return [f"{method.name} at {x:g}{where[scene.scene.name]}" for scene in found.scenes for method in experiment.method
+            if method.series is not None and (x := _position(experiment, method, method.series, scene)) < method.series.value]
+
+
+def _values(scene: FinishedScene, method: str, quantity: str) -> list[float]:
+    """The quantity of every seed."""
     if quantity in ERRORS:
-        assert reference is not None
-        return ERRORS[quantity](cell.image()["mean"], reference.mean)
+        return [float(error) for error in scene.final[method].errors[quantity]]
     if quantity == "bytes":
-        stored = max((done["stored"] for done in cell.info["passes"]), default=0)
-        return (cell.info["records"] * cell.info["bytes_per_record"] + PARTICLE_BYTES * stored) / 1e6
-    return float(cell.info[quantity])
+        return [_bytes(cell) / 1e6 for cell in scene.cells[method]]
+    return [float(cell.info[quantity]) for cell in scene.cells[method]]
+
+
+def _bytes(cell: Cell) -> int:
+    stored = max((done["stored"] for done in cell.info["passes"]), default=0)
+    return int(cell.info["records"] * cell.info["bytes_per_record"] + PARTICLE_BYTES * stored)
 
 
 def _abscissa(experiment: Experiment) -> str:
@@ -109,9 +113,10 @@ def _abscissa(experiment: Experiment) -> str:
     return " or ".join(setting.partition(".")[2].replace("_", " ") for setting in settings)
 
 
-def _caption(experiment: Experiment, results: Results) -> str:
-    n, budget = len(experiment.seeds), experiment.budget
+def _caption(found: Finished) -> str:
+    experiment = found.experiment
+    n = len(experiment.seeds)
     seeds = f"Median and 5\N{EN DASH}95 % band of {n} seeds" if n > 1 else "One seed"
-    spent = f"{budget.seconds:g} s a method, training included" if budget.seconds else f"{budget.spp} samples per pixel"
+    cut = f" Drawn at what the budget had time for: {'; '.join(short_of)}." if (short_of := _cut_short(found)) else ""
     memory = " Memory: the guide, and the most particles stored at once." if "bytes" in experiment.sweep.y else ""
-    return f"{seeds}; {spent}.{memory} {figures.machine(read_json(results.folder / 'env.json'))}"
+    return f"{seeds}; {sheet.budget(experiment)}.{cut}{memory} {figures.machines(found)}"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench.files import replacing
+from olpm_bench.bench.summary import print_whole
 from olpm_bench.report import figures
 
 if TYPE_CHECKING:
@@ -36,10 +37,7 @@ def print_table(outcomes: Sequence[Outcome], pictures: dict[str, str], console: 
         mark = Text("passed", style="green") if o.verdict.passed else Text("FAILED", style="bold red")
         table.add_row(o.check.name, mark, Text(statistic(o.verdict)), f"{o.seconds:.1f}", Text(o.check.sentence))
     console = console or Console()
-    terminal, needed = console.width, console.measure(table, options=console.options.update(width=1000)).maximum
-    console.width = max(terminal, needed)
-    console.print(table)
-    console.width = terminal
+    print_whole(table, console)
     for o in outcomes:
         if not o.verdict.passed:
             line(console, f"{o.check.name} FAILED: {o.verdict.worst}", "bold red")

@@ -35,6 +35,7 @@ def test_a_cell_spends_its_samples_and_repeats_bit_for_bit(experiment):
     np.testing.assert_array_equal(first.checkpoints[-1], first.image["mean"])
     assert (first.image["count"] == 11).all() and np.isfinite(first.image["variance"]).all()
     assert first.info["records"] == 0 and first.info["train_seconds"] == 0 and first.info["passes"] == []
+    assert first.info["training_ended"] is None
     assert first.info["compiled_on_the_clock"] == 0
     assert 0 < first.info["charged_seconds"] <= first.info["wall_seconds"] + 1e-9
     other = cell.measure(experiment.cells()[2], scene, warm)         # another seed
@@ -156,7 +157,7 @@ def trained(experiment, monkeypatch):
 
 def test_training_ends_at_its_share_and_its_second_half_enters(trained):
     done = trained("seconds = 20", "share = 0.4, camera_passes = 30")
-    assert done.info["training_passes"] == 8                            # of 1 s each
+    assert done.info["training_passes"] == 8 == done.info["training_ended"]     # of 1 s each
     assert done.info["train_seconds"] == pytest.approx(8 - 4 * 0.75)    # passes 4 to 7 are images, 3/4 of their time rendering
     assert done.info["render_seconds"] == pytest.approx(12 + 4 * 0.75)
     assert done.info["charged_seconds"] == pytest.approx(20)
@@ -169,6 +170,12 @@ def test_training_ends_at_its_share_and_its_second_half_enters(trained):
 def test_training_may_end_before_its_share(trained):
     done = trained("seconds = 20", "share = 0.9, camera_passes = 5")
     assert done.info["training_passes"] == 7 and done.info["charged_seconds"] == pytest.approx(20)
+
+
+def test_training_without_a_pass_has_no_end(trained, monkeypatch):
+    monkeypatch.setattr(Passes, "run", lambda self: iter(()))
+    done = trained("seconds = 20", "share = 0.4")
+    assert done.info["training_passes"] == 0 and done.info["training_ended"] is None
 
 
 def test_without_blending_no_training_image_enters(trained):

@@ -58,7 +58,10 @@ def cells(experiment: Experiment, root: Path) -> list:
 def test_a_rerun_skips_what_is_complete(experiment, root, monkeypatch):
     assert run.run(experiment, root) == []
     assert all(cells(experiment, root))
-    assert json.loads((root / "test" / "env.json").read_text())["variant"] == "llvm_ad_rgb"
+    environment = json.loads((root / "test" / "env.json").read_text())
+    assert environment["variant"] == "llvm_ad_rgb"
+    assert all(cell.info["machine"].items() >= {k: environment[k] for k in ("cpu", "cores", "threads")}.items()
+               for cell in cells(experiment, root))
     assert experiment_file.load(root / "test" / "experiment.toml").cells()[0].key == experiment.cells()[0].key
     monkeypatch.setattr(run, "measure", counted := Counted())
     assert run.run(experiment, root) == [] and counted.calls == 0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from olpm_bench.bench import config, experiment_file, metrics, statistics, summary
+from olpm_bench.bench import config, experiment_file, finished, statistics, summary
 from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Results
@@ -51,7 +51,7 @@ def known(tmp_path):
 
 
 def summarised(known) -> dict:
-    return summary.summarise(known.experiment, known.results, known.references)
+    return summary.summarise(finished.read(known.experiment, known.results, known.references))
 
 
 def test_rows_have_the_agreed_keys_in_the_order_of_the_toml(known):
@@ -105,7 +105,7 @@ def test_a_scene_without_reference_has_no_errors_but_all_the_rest(known):
         errors = KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1]
         assert [row[key] for key in errors] == [None] * len(errors)
         assert {k: v for k, v in row.items() if k not in errors} == {k: v for k, v in full.items() if k not in errors}
-    assert summary.speed_ups(without_reference(known).experiment, known.results, {}) == {"Fast": {}}
+    assert finished.read(without_reference(known).experiment, known.results, {}).speed_ups == {"Fast": {}}
     console = Console(file=io.StringIO(), width=200)
     summary.print_table({"rows": rows}, console)
     shown = console.file.getvalue().splitlines()[2].split()
@@ -119,7 +119,7 @@ def test_gains_and_speed_ups_are_over_the_baseline(known):
     assert fast["gain_low"] <= fast["gain"] <= fast["gain_high"] and fast["training_passes"] == 4
     known.experiment = known.experiment.model_copy(update={"baseline": "Fast"})
     assert [row["gain"] for row in summarised(known)["rows"]] == pytest.approx([1 / fast["gain"], 1])
-    found = summary.speed_ups(known.experiment, known.results, known.references)
+    found = finished.read(known.experiment, known.results, known.references).speed_ups
     assert list(found) == ["Slow"] and found["Slow"]["door_ajar"].value == pytest.approx(0.25, rel=1e-4)
 
 
@@ -147,40 +147,22 @@ def test_metrics_take_cells_of_other_versions_but_not_of_other_settings(known):
     path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
     cell = json.loads(path.read_text())
     path.write_text(json.dumps({**cell, "key": "0123456789abcdef"}))
-    again = summary.summarise(known.experiment, known.results, known.references, any_version=True)
+    again = summary.summarise(finished.read(known.experiment, known.results, known.references, any_version=True))
     path.write_text(json.dumps(cell))
     assert again == summarised(known)
     for changes in ({"budget": config.Budget(seconds=17)}, {"integrator": IntegratorSettings(window=0.3)}):
         with pytest.raises(ResultError, match=r"door_ajar / Slow / seed 4 .* is of another configuration"):
-            summary.summarise(known.experiment.model_copy(update=changes), known.results, known.references, any_version=True)
-
-
-def test_cells_say_on_which_cpus_they_were_made(known):
-    for seed, cpu in ((4, "Abacus 2"), (7, "Abacus 1"), (5, "Abacus 2")):
-        path = known.results.cell_folder("door_ajar", "Slow", seed) / "cell.json"
-        path.write_text(json.dumps({**json.loads(path.read_text()), "machine": {"cpu": cpu}, "digests": {}}))
-    assert summary.cpus(known.experiment, known.results) == ["Abacus 1", "Abacus 2"]
-
-
-def test_a_missing_reference_is_named_with_the_command_that_makes_it(known):
-    with pytest.raises(ResultError, match="scene door_ajar has no reference; make it with: olpm-bench reference "):
-        summary.summarise(known.experiment, known.results, {})
+            finished.read(known.experiment.model_copy(update=changes), known.results, known.references, any_version=True)
 
 
 def test_speed_up_over_the_first_method_at_equal_error(known):
-    found = summary.speed_ups(known.experiment, known.results, known.references)
+    found = finished.read(known.experiment, known.results, known.references).speed_ups
     assert list(found) == ["Fast"]
     interval = found["Fast"]["door_ajar"]
     assert interval.value == pytest.approx(4, rel=1e-4) and interval.low == pytest.approx(4, rel=1e-4)
     console = Console(file=io.StringIO(), width=120)
     summary.print_speed_ups(found, "Slow", console)
     assert console.file.getvalue() == "door_ajar / Fast: 4x (4-4) as fast as Slow at equal L1\n"
-
-
-def test_error_curve_of_any_metric_over_samples(known):
-    cells = summary.complete_cells(known.experiment, known.results)["door_ajar", "Slow"]
-    curve = summary.error_curve(cells, known.references["door_ajar"], metrics.relmse, over="spp")
-    assert curve.median[-1] == pytest.approx(0.25 / 1.01, rel=1e-6) and curve.times[-1] == 16
 
 
 def test_speed_ups_over_scenes_are_averaged_where_all_are_known():

@@ -9,7 +9,7 @@ import pytest
 from skimage.io import imread
 
 from olpm_bench.bench import summary
-from olpm_bench.report import page
+from olpm_bench.report import page, sheet
 
 pytest.importorskip("jinja2", reason="needs the extra report")
 pytest.importorskip("simpleimageio", reason="needs the extra report")
@@ -24,8 +24,7 @@ def opened(finished, tmp_path):
     executable = next(filter(None, map(shutil.which, NAMES)), None)
     if executable is None:
         pytest.skip(f"needs a browser on the PATH: {', '.join(NAMES)}")
-    summarised = summary.summarise(finished.experiment, finished.results, finished.references)
-    page.page(finished.results, finished.experiment, finished.references, summarised, [])
+    page.page(finished, summary.summarise(finished)["rows"], sheet.blocks(finished), [])
     complaints, requests = [], []
     with driver.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])      # root needs that

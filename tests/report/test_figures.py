@@ -1,18 +1,16 @@
 """The convergence figure: what it shows, and that it refuses to draw what is not there."""
 from __future__ import annotations
 
+import dataclasses
 import itertools
-import json
-import shutil
 
-import matplotlib
+import matplotlib.figure
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from skimage.io import imread
 
 from olpm_bench.bench import config, statistics, summary
-from olpm_bench.bench.files import ResultError
 from olpm_bench.report import figures, sheet
 
 TIMES = np.geomspace(1, 16, 9)
@@ -22,7 +20,7 @@ def panel(levels: dict[str, float], floor: float = 0.0, budget: float = 16) -> f
     curves = {name: statistics.common_curve([TIMES] * 3, [level * k / np.sqrt(TIMES) for k in (0.9, 1, 1.2)])
               for name, level in levels.items()}
     others = list(levels)[1:]
-    return figures.Panel("scene", curves, dict.fromkeys(others, 1.5), budget, floor,
+    return figures.Panel("scene", curves, {name: i for i, name in enumerate(levels)}, dict.fromkeys(others, 1.5), budget, floor,
                          dict.fromkeys(others, statistics.Interval(12.3, 10.4, 15.1)))
 
 
@@ -51,6 +49,18 @@ def test_no_text_overlaps_another_or_leaves_the_figure(levels, floor):
         assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height, f"{text!r} is cut off"
     for (text, box), (other, other_box) in itertools.combinations(boxes, 2):
         assert not box.padded(-0.5).overlaps(other_box.padded(-0.5)), f"{text!r} lies on {other!r}"
+
+
+@pytest.mark.parametrize("floor", [0.02, 0.01, 1e-5])
+@pytest.mark.parametrize("ends", [(1.1, 1.15, 1.2), (6, 6.2, 6.4), (14, 14.2, 14.4)])
+def test_no_text_lies_on_the_triangles_of_training(floor, ends):
+    levels = {"Path tracing": 1.0, "A": 0.3, "B": 0.2, "C": 0.1}
+    figure = drawn(dataclasses.replace(panel(levels, floor), training=dict(zip(list(levels)[1:], ends, strict=True))))
+    triangles = [line.get_window_extent() for line in figure.axes[0].lines
+                 if line.get_marker() == "^" and line.get_xdata()[0] < 1 and len(line.get_xdata()) == 1]
+    assert len(triangles) == 3
+    for text in visible_texts(figure):
+        assert not any(text.get_window_extent().overlaps(triangle) for triangle in triangles), text.get_text()
 
 
 def test_methods_differ_in_colour_and_in_marker_and_in_dash():
@@ -89,15 +99,13 @@ def test_speed_ups_are_short(interval, text):
 def test_equal_samples_are_shown_beside_equal_time(finished, monkeypatch):
     panels = []
     monkeypatch.setattr(figures, "draw", lambda drawn, *_: panels.extend(drawn) or matplotlib.figure.Figure())
-    figures.curves(finished.results, finished.experiment, finished.references)
+    figures.curves(finished)
     samples = finished.experiment.model_copy(update={"budget": config.Budget(spp=160, checkpoints=5)})
-    monkeypatch.setattr(summary, "complete_cells", lambda *_: CELLS)
-    CELLS = {("door_ajar", m.name): [finished.results.read_cell("door_ajar", m.name, s) for s in range(3)]
-             for m in finished.experiment.method}
-    figures.curves(finished.results, samples, finished.references)
+    figures.curves(dataclasses.replace(finished, experiment=samples))
     alone, spp, seconds = panels
     assert [p.abscissa for p in panels] == ["time [s], training included", "samples per pixel", "time [s], training included"]
     assert (spp.budget, spp.training, spp.speed_ups) == (160, {}, {}) and seconds.training == alone.training
+    assert alone.training == {"Quick & dirty": pytest.approx(3.1)}          # median over seeds, on the axis of charged seconds
     assert list(alone.speed_ups) == ["Quick & dirty"] and alone.speed_ups["Quick & dirty"].value == pytest.approx(6.25, rel=0.2)
     assert seconds.speed_ups == alone.speed_ups and (alone.budget, seconds.budget) == (16, None)
 
@@ -129,10 +137,10 @@ def test_spread_moves_as_little_as_needed():
 
 
 def test_from_a_results_folder(finished):
-    figures.curves(finished.results, finished.experiment, finished.references)
+    assert figures.curves(finished) == ["figure.png", "figure.pdf", "figure.svg"]
     assert imread(finished.results.folder / "figure.png").std() > 10
     assert (finished.results.folder / "figure.pdf").read_bytes().startswith(b"%PDF")
-    note = figures.caption(finished.experiment, {"cpu": "Abacus 2", "threads": 2})
+    note = figures.caption(finished, trained=True)
     assert note == ("Median and 5\N{EN DASH}95 % band of 3 seeds. Triangles mark the end of training. \N{MULTIPLICATION SIGN}: "
                     "times as fast as Path tracing to an equal error, 90 % interval. Abacus 2, 2 threads.")
 
@@ -149,7 +157,7 @@ def test_gains_have_a_dot_an_interval_and_a_number_each(methods, scenes):
     rows = gain_rows(methods, scenes)
     rows[-1] |= {"gain_low": None, "gain_high": None}
     with figures.style():
-        figure = figures.draw_gains(rows, ["PT", *methods], "PT", "Title", "Note.")
+        figure = figures.draw_gains(rows, {name: 1 + i for i, name in enumerate(methods)}, "PT", "Title", "Note.")
         figure.set_dpi(matplotlib.rcParams["savefig.dpi"])
         FigureCanvasAgg(figure).draw()
     axes = figure.axes[0]
@@ -169,44 +177,27 @@ def test_gains_have_a_dot_an_interval_and_a_number_each(methods, scenes):
 
 
 def test_gains_from_a_results_folder(finished):
-    summarised = summary.summarise(finished.experiment, finished.results, finished.references)
-    assert figures.gains(finished.results, finished.experiment, summarised)
+    assert figures.gains(finished, summary.summarise(finished)["rows"]) == ["gains.png", "gains.pdf", "gains.svg"]
     assert imread(finished.results.folder / "gains.png").std() > 10
     assert (finished.results.folder / "gains.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_no_gains_without_another_method_or_seed(finished, tmp_path):
-    alone = [row for row in summary.summarise(finished.experiment, finished.results, finished.references)["rows"]
-             if row["method"] == "Path tracing"]
+def test_no_gains_without_another_method_or_seed(finished):
+    alone = [row for row in summary.summarise(finished)["rows"] if row["method"] == "Path tracing"]
     one_seed = [{"scene": "door_ajar", "method": method, "gain": None} for method in ("Path tracing", "Quick & dirty")]
     for rows in (alone, one_seed):
-        assert not figures.gains(finished.results, finished.experiment, {"rows": rows}, tmp_path)
-    assert not list(tmp_path.glob("gains.*"))
+        assert figures.gains(finished, rows) == []
+    assert not list(finished.results.folder.glob("gains.*"))
 
 
-def test_scenes_without_reference_are_left_out(finished, tmp_path):
-    scene = finished.experiment.scene[0]
-    bare = config.Scene(name="cornell_box", width=scene.width, height=scene.height, reference=config.NO_REFERENCE)
-    both = finished.experiment.model_copy(update={"scene": [scene, bare]})
-    for cell in both.cells():
-        folder = finished.results.cell_folder(cell.scene.name, cell.method.name, cell.seed)
-        if cell.scene is bare:
-            shutil.copytree(finished.results.cell_folder(scene.name, cell.method.name, cell.seed), folder)
-            (folder / "cell.json").write_text(json.dumps(json.loads((folder / "cell.json").read_text()) | {"key": cell.key}))
-    for experiment, out in ((finished.experiment, "one"), (both, "both")):
-        figures.curves(finished.results, experiment, finished.references, tmp_path / out)
-        sheet.sheet(finished.results, experiment, finished.references, tmp_path / out)
-    for name in ("figure.png", "sheet.png"):
-        assert imread(tmp_path / "both" / name).shape == imread(tmp_path / "one" / name).shape
+def test_scenes_without_reference_are_left_out(finished):
+    def drawn() -> list:
+        figures.curves(finished)
+        sheet.sheet(finished, sheet.blocks(finished))
+        return [imread(finished.results.folder / name).shape for name in ("figure.png", "sheet.png")]
 
-
-def test_refuses_to_draw_with_a_missing_cell_and_names_the_command(finished):
-    (finished.results.cell_folder("door_ajar", "Quick & dirty", 1) / "cell.json").unlink()
-    with pytest.raises(ResultError, match=r"Quick & dirty / seed 1 .* is missing; make it with: olpm-bench run "):
-        figures.curves(finished.results, finished.experiment, finished.references)
-    assert not (finished.results.folder / "figure.png").exists()
-
-
-def test_refuses_to_draw_without_a_reference_and_names_the_command(finished):
-    with pytest.raises(ResultError, match="scene door_ajar has no reference; make it with: olpm-bench reference "):
-        figures.curves(finished.results, finished.experiment, {})
+    one, scene = drawn(), finished.scenes[0]
+    finished.scenes.append(dataclasses.replace(scene, scene=scene.scene.model_copy(update={"name": "bare"}), reference=None))
+    assert drawn() == one
+    finished.scenes.pop(0)
+    assert figures.curves(finished) == sheet.sheet(finished, sheet.blocks(finished)) == []

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from olpm_bench.bench import config, run, summary
+from olpm_bench.bench.finished import read
 from olpm_bench.report import figures, page, sheet
 
 pytest.importorskip("jinja2", reason="needs the extra report")
@@ -19,8 +20,7 @@ pytest.importorskip("simpleimageio", reason="needs the extra report")
 
 
 def written(finished, drawn: Sequence[str] = ()) -> str:
-    summarised = summary.summarise(finished.experiment, finished.results, finished.references)
-    page.page(finished.results, finished.experiment, finished.references, summarised, drawn)
+    assert page.page(finished, summary.summarise(finished)["rows"], sheet.blocks(finished), drawn) == ["report.html"]
     return (finished.results.folder / "report.html").read_text(encoding="utf-8")
 
 
@@ -49,9 +49,8 @@ class Page(HTMLParser):
 
 
 def test_the_page_stands_alone_and_its_identifiers_are_its_own(finished):
-    summarised = summary.summarise(finished.experiment, finished.results, finished.references)
-    figures.curves(finished.results, finished.experiment, finished.references)
-    figures.gains(finished.results, finished.experiment, summarised)
+    figures.curves(finished)
+    figures.gains(finished, summary.summarise(finished)["rows"])
     text = written(finished, ["figure", "gains"])
     found = Page(text)
     assert all(address.startswith(("#", "data:")) for address in found.addresses) and found.addresses
@@ -63,7 +62,7 @@ def test_the_page_stands_alone_and_its_identifiers_are_its_own(finished):
 
 def test_the_page_holds_the_numbers_the_configuration_and_the_machine(finished):
     text = written(finished)
-    rows = summary.summarise(finished.experiment, finished.results, finished.references)["rows"]
+    rows = summary.summarise(finished)["rows"]
     cells = Page(text).cells
     assert len(cells) == len(rows) * len(page.HEADERS)
     for i, row in enumerate(rows):
@@ -85,10 +84,10 @@ def decoded(book: dict, index: int) -> np.ndarray:
 
 
 def test_the_viewer_is_given_the_stored_pixels(finished):
-    shown, = page.viewers(finished.results, finished.experiment, finished.references)
+    shown, = page.viewers(finished, sheet.blocks(finished))
     book = json.loads(json.dumps(shown["data"]))
     assert book["names"] == ["Reference", "Path tracing", "Quick & dirty", "error of Path tracing", "error of Quick & dirty"]
-    block, = sheet.blocks(finished.results, finished.experiment, finished.references)
+    block, = sheet.blocks(finished)
     assert (decoded(book, 0) == block.reference).all() and (decoded(book, 2) == block.images["Quick & dirty"]).all()
     error = sheet.relative_error(block.images["Path tracing"], block.reference)
     np.testing.assert_allclose(decoded(book, 3)[..., 0], error, rtol=1e-6)
@@ -99,11 +98,11 @@ def test_the_viewer_is_given_the_stored_pixels(finished):
 
 
 def test_large_images_are_packed_and_then_averaged(finished, monkeypatch):
-    exact, = page.viewers(finished.results, finished.experiment, finished.references)
+    exact, = page.viewers(finished, sheet.blocks(finished))
     pixels = 5 * 18 * 32
     for limit, kind, k in ((4 * pixels, "rgbe", 1), (3 * pixels, "rgbe", 2)):
         monkeypatch.setattr(page, "LARGEST", limit)
-        shown, = page.viewers(finished.results, finished.experiment, finished.references)
+        shown, = page.viewers(finished, sheet.blocks(finished))
         book = shown["data"]
         assert set(book["types"]) == {kind} and (book["width"], book["height"]) == (32 // k, 18 // k)
         assert sum(decoded(book, i).nbytes for i in range(5)) <= limit
@@ -122,9 +121,9 @@ def test_shared_exponents_hold_any_brightness():
 
 def test_without_reference_there_are_images_and_gains_and_no_errors(finished):
     scene = finished.experiment.scene[0].model_copy(update={"reference": config.NO_REFERENCE})
-    finished.experiment, finished.references = finished.experiment.model_copy(update={"scene": [scene]}), {}
+    finished = read(finished.experiment.model_copy(update={"scene": [scene]}), finished.results, {})
     text = written(finished)
-    shown, = page.viewers(finished.results, finished.experiment, {})
+    shown, = page.viewers(finished, [])
     assert shown["data"]["names"] == ["Path tracing", "Quick & dirty"] and "the first of 3 seeds" in shown["caption"]
     assert (decoded(shown["data"], 0) == finished.results.read_cell("door_ajar", "Path tracing", 0).image()["mean"]).all()
     assert "olpm-bench reference" not in text
@@ -134,10 +133,9 @@ def test_without_reference_there_are_images_and_gains_and_no_errors(finished):
 
 def test_what_is_missing_of_the_extra_is_said(finished, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "figuregen", None)
-    monkeypatch.setattr(run, "references", lambda *arguments: finished.references)
+    monkeypatch.setattr(run, "references", lambda *arguments: {"door_ajar": finished.scenes[0].reference})
     for module, name in ((figures, "curves"), (figures, "gains"), (sheet, "sheet")):
-        monkeypatch.setattr(module, name, lambda *arguments: None)
-    monkeypatch.setattr(page, "svg", lambda *arguments: "<svg></svg>")
+        monkeypatch.setattr(module, name, lambda *arguments: [])
     folder = finished.results.folder.rename(finished.results.folder.with_name(finished.experiment.path.stem))
     run.report(finished.experiment, folder.parent)
     assert "report.html and crops.pdf need figuregen: pip install 'olpm-bench[report]'" in capsys.readouterr().out

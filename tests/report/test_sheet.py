@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from skimage.io import imread
 
-from olpm_bench.bench.files import ResultError
+from olpm_bench.bench import metrics
 from olpm_bench.report import figures, sheet, tonemap
 
 RNG = np.random.default_rng(1)
@@ -67,22 +67,30 @@ def test_images_stand_on_the_sheet_pixel_for_pixel(tmp_path):
 
 
 def test_from_a_results_folder(finished):
-    sheet.sheet(finished.results, finished.experiment, finished.references)
+    assert sheet.sheet(finished, sheet.blocks(finished)) == ["sheet.png"]
     image = imread(finished.results.folder / "sheet.png")
     assert image.shape[1] > 3 * 480 and image[..., :3].std() > 20
 
 
-def test_the_seed_shown_is_the_one_with_the_median_l1():
-    reference = np.zeros((4, 4, 3))
-    images = [reference + error for error in (0.3, 0.1, 0.2)]
-    assert sheet._median_image(images, reference) is images[2]
-    assert sheet._median_image(images[:2], reference) is images[1]
+def test_the_seed_shown_is_the_one_with_the_median_l1(finished):
+    assert sheet.median_seed(np.array([0.3, 0.1, 0.2])) == 2 and sheet.median_seed(np.array([0.3, 0.1])) == 1
+    block, = sheet.blocks(finished)
+    for name, cells in finished.scenes[0].cells.items():
+        errors = [metrics.l1(cell.image()["mean"], block.reference) for cell in cells]
+        assert block.errors[name][0] == np.median(errors)
 
 
-def test_refuses_to_draw_with_a_missing_cell(finished):
-    (finished.results.cell_folder("door_ajar", "Path tracing", 2) / "cell.json").unlink()
-    with pytest.raises(ResultError, match=r"door_ajar / Path tracing / seed 2 .* is missing"):
-        sheet.sheet(finished.results, finished.experiment, finished.references)
+def test_a_long_note_is_wrapped_and_not_cut_off():
+    reference = RNG.uniform(0, 1, (18, 32, 3))
+    with figures.style():
+        block = sheet.Block("scene", reference, None, {"A": reference * 0.9})
+        figure = sheet.draw([block], "; ".join(["Abacus 2, 2 threads"] * 12))
+        figure.canvas.draw()
+        note = next(text for text in figure.axes[0].texts if "Abacus" in text.get_text())
+        box, (width, height) = note.get_window_extent(), figure.canvas.get_width_height()
+    assert note.get_text().count("\n") and 0 < box.x0 < box.x1 < width and 0 < box.y0 < box.y1 < height
+    others = [text.get_window_extent() for text in figure.axes[0].texts if text is not note and text.get_text()]
+    assert not any(box.overlaps(other) for other in others)
 
 
 def test_a_sheet_of_several_scenes_and_invalid_pixels():

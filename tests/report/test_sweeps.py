@@ -10,8 +10,8 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from skimage.io import imread
 
-from olpm_bench.bench import experiment_file
-from olpm_bench.bench.files import ResultError
+from olpm_bench.bench import config, experiment_file
+from olpm_bench.bench.finished import Finished, read
 from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Results
 from olpm_bench.report import figures, sweeps
@@ -20,27 +20,31 @@ TRUTH = np.ones((6, 8, 3), np.float32)
 ERRORS = {"Path tracing": 0.9, "Stored": 2.0, "On-line": 1.0}      # over sqrt(passes) but for path tracing
 
 
-def made(tmp_path, reference: str | None = None, **sweep) -> SimpleNamespace:
-    """Cells with errors of ERRORS times 0.9, 1, 1.2 for three seeds; 1000 photons a pass, all stored or one pass at a time."""
+def made(tmp_path, reference: str | None = None, passes: tuple[int, ...] = (1, 4, 16), most: int = 99, **sweep) -> Finished:
+    """Cells with errors of ERRORS times 0.9, 1, 1.2 for three seeds; 1000 photons a pass, all stored or one pass at a time.
+
+    most: on-line passes that were done, whatever was asked for.
+    """
     scene = {"name": "door_ajar", "width": 8, "height": 6} | ({"reference": reference} if reference else {})
-    series = {"representation": {"type": "jensen"}, "sweep": {"training.passes": [1, 4, 16]}}
+    series = {"representation": {"type": "jensen"}, "sweep": {"training.passes": list(passes)}}
     experiment = experiment_file.parse({
-        "title": "Synthetic", "seeds": 3, "budget": {"spp": 16}, "scene": [scene], "sweep": sweep, "method": [
-            {"name": "Path tracing"}, {"name": "Stored", **series, "training": {"schedule": "single_batch"}},
-            {"name": "On-line", **series}]}, "synthetic.toml", tmp_path)
+        "title": "Synthetic", "seeds": 3, "budget": {"spp": 16}, "scene": [scene], "sweep": sweep, "training": {"photons": 1000},
+        "method": [{"name": "Path tracing"}, {"name": "Stored", **series, "training": {"schedule": "single_batch"}},
+                   {"name": "On-line", **series}]}, "synthetic.toml", tmp_path)
     results = Results(tmp_path / "results" / "synthetic")
     for cell in experiment.cells():
-        name, passes = (cell.method.series.name, int(cell.method.series.value)) if cell.method.series else (cell.method.name, 0)
-        image = TRUTH + np.float32(ERRORS[name] * (0.9, 1, 1.2)[cell.seed] / np.sqrt(max(passes, 1)))
-        trained = [{"photons": 1000 * passes, "stored": 10_000 * passes}] if name == "Stored" else (
-            [{"photons": 1000, "stored": 10_000}] * passes)
-        info = {"key": cell.key, "records": 100 if passes else 0, "bytes_per_record": 200, "train_seconds": 0.5 * passes,
-                "passes": trained}
+        sweep = cell.method.series
+        name, asked = (sweep.name, int(sweep.value)) if sweep else (cell.method.name, 0)
+        image = TRUTH + np.float32(ERRORS[name] * (0.9, 1, 1.2)[cell.seed] / np.sqrt(max(asked, 1)))
+        trained = [{"photons": 1000 * asked, "stored": 10_000 * asked}] if name == "Stored" else (
+            [{"photons": 1000, "stored": 10_000}] * min(asked, most))
+        info = {"key": cell.key, "records": 100 if asked else 0, "bytes_per_record": 200, "charged_seconds": 1.0,
+                "train_seconds": 0.5 * asked, "passes": trained}
         results.write_cell(cell.scene.name, cell.method.name, cell.seed, info, [{"seconds": 1.0, "train_seconds": 0, "spp": 16}],
                            {"mean": image, "variance": TRUTH, "count": TRUTH[..., 0]}, [image])
     results.write_json("env.json", {"schema_version": 1, "cpu": "Abacus 2", "threads": 2})
     reference = Reference(TRUTH, TRUTH + 0.01, TRUTH, TRUTH, {"spp_a": 1, "spp_b": 0})
-    return SimpleNamespace(experiment=experiment, results=results, references={"door_ajar": reference})
+    return read(experiment, results, {"door_ajar": reference})
 
 
 @pytest.fixture
@@ -59,7 +63,7 @@ def drawn(monkeypatch):
 
 def test_a_curve_a_series_over_the_setting_and_level_lines(tmp_path, drawn):
     known = made(tmp_path)
-    assert sweeps.sweeps(known.results, known.experiment, known.references)
+    assert sweeps.sweeps(known)
     panel, = drawn.panels
     assert (panel.abscissa, panel.ordinate, panel.slope) == ("passes", "L1 error", False)
     assert list(panel.curves) == ["Path tracing", "Stored", "On-line"]
@@ -72,13 +76,36 @@ def test_a_curve_a_series_over_the_setting_and_level_lines(tmp_path, drawn):
     assert (known.results.folder / "sweep.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_passes_that_the_budget_cut_off_are_not_drawn_as_done(tmp_path, drawn):
+    known = made(tmp_path, most=2)
+    sweeps.sweeps(known)
+    panel, = drawn.panels
+    np.testing.assert_array_equal(panel.curves["Stored"].times, [1, 4, 16])         # all in one pass
+    np.testing.assert_array_equal(panel.curves["On-line"].times, [1, 2, 2])
+    assert "Drawn at what the budget had time for: On-line, passes 4 at 2; On-line, passes 16 at 2." in sweeps._caption(known)
+    assert "Drawn at" not in sweeps._caption(made(tmp_path))
+    sweeps.sweeps(made(tmp_path, most=0))                                           # no time for any
+    assert list(drawn.panels[0].curves) == ["Path tracing", "Stored"]
+
+
+@pytest.mark.parametrize("setting, done", [("training.passes", 2), ("training.camera_passes", 1), ("training.neighbours", 9)])
+def test_passes_of_particles_and_of_camera_paths_are_counted_apart(tmp_path, setting, done):
+    """Of passes of importons alone, of both, and of an image; and of one more image after training."""
+    known = made(tmp_path)
+    scene, method = known.scenes[0], known.experiment.method[-1]
+    counts = [(0, 0), (1000, 0), (1000, 0), (0, 4), (0, 4)]
+    for cell in scene.cells[method.name]:
+        cell.info["passes"] = [{"index": i, "passes": 4, "photons": n, "spp": spp} for i, (n, spp) in enumerate(counts)]
+    series = config.Series(name="On-line", setting=setting, value=9)
+    assert sweeps._position(known.experiment, method, series, scene) == done
+
+
 def test_memory_over_the_photons_traced(tmp_path, drawn):
     """Stored, 48 bytes a particle grow; on-line, those of one pass do not.  What learns nothing has no curve."""
     known = made(tmp_path, x="photons", y=["l1", "bytes", "train_seconds"])
-    assert sweeps.sweeps(known.results, known.experiment, known.references)
+    assert sweeps.sweeps(known)
     _, memory, seconds = drawn.panels
     assert memory.abscissa == "photons traced" and list(memory.curves) == ["Stored", "On-line"] == list(seconds.curves)
-    assert memory.looks == seconds.looks == ("Path tracing", "Stored", "On-line")
     for curve in memory.curves.values():
         np.testing.assert_array_equal(curve.times, [1000, 4000, 16_000])
     np.testing.assert_allclose(memory.curves["Stored"].median, 0.02 + 0.48 * np.array([1, 4, 16]))
@@ -88,7 +115,7 @@ def test_memory_over_the_photons_traced(tmp_path, drawn):
 
 def test_no_text_overlaps_another_or_leaves_the_figure(tmp_path, drawn):
     known = made(tmp_path, x="photons", y=["l1", "bytes"])
-    sweeps.sweeps(known.results, known.experiment, known.references)
+    sweeps.sweeps(known)
     with figures.style():
         figure = drawn.figure
         figure.set_dpi(matplotlib.rcParams["savefig.dpi"])
@@ -105,16 +132,37 @@ def test_no_text_overlaps_another_or_leaves_the_figure(tmp_path, drawn):
 
 def test_errors_need_a_reference_and_memory_does_not(tmp_path, drawn):
     known = made(tmp_path, reference="none", y=["l1", "bytes"])
-    assert sweeps.sweeps(known.results, known.experiment, {})
+    assert sweeps.sweeps(known)
     assert [panel.ordinate for panel in drawn.panels] == ["memory of learning [MB]"]
     bare = made(tmp_path, reference="none", y=["relmse"])
-    assert not sweeps.sweeps(bare.results, bare.experiment, {})
+    assert not sweeps.sweeps(bare)
 
 
-def test_nothing_is_drawn_without_a_sweep_and_refused_without_its_cells(tmp_path, finished):
-    assert not sweeps.sweeps(finished.results, finished.experiment, finished.references)
-    known = made(tmp_path)
-    (known.results.cell_folder("door_ajar", "Stored, passes 4", 1) / "cell.json").unlink()
-    with pytest.raises(ResultError, match=r"Stored, passes 4 / seed 1 .* is missing; make it with: olpm-bench run "):
-        sweeps.sweeps(known.results, known.experiment, known.references)
-    assert not list(known.results.folder.glob("sweep.*"))
+def test_nothing_is_drawn_without_a_sweep(finished):
+    assert sweeps.sweeps(finished) == []
+    assert not list(finished.results.folder.glob("sweep.*"))
+
+
+@pytest.mark.parametrize("passes", [(1, 4, 16), (1, 2, 4, 16)], ids=["a look each", "a look a sweep"])
+def test_a_method_looks_the_same_in_all_figures(tmp_path, monkeypatch, passes):
+    known, colours = made(tmp_path, passes=passes), {}
+    rows = [{"scene": "door_ajar", "method": method.name, "gain": 2.0, "gain_low": 1.5, "gain_high": 2.5}
+            for method in known.experiment.method]
+
+    def keep(figure, folder, name: str) -> list[str]:
+        texts = {text.get_text(): text.get_color() for text in figure.findobj(matplotlib.text.Text)}
+        colours[name] = {look: texts[look] for look in known.experiment.looks if look in texts}
+        return []
+
+    monkeypatch.setattr(figures, "save", keep)
+    figures.curves(known)
+    figures.gains(known, rows)
+    sweeps.sweeps(known)
+    few = len(known.experiment.method) <= config.LOOKS
+    assert len(colours["figure"]) == (7 if few else 3) and len(colours["gains"]) == len(known.experiment.method) - 1
+    assert len(set(colours["figure"].values())) == len(colours["figure"])
+    for name, colour in colours["figure"].items():
+        assert colours["gains"].get(name, colour) == colour
+    for name in ("Stored", "On-line"):
+        assert colours["sweep"][name] == colours["figure"][f"{name}, passes 16"]
+        assert few or {colours["gains"][f"{name}, passes {n}"] for n in passes} == {colours["sweep"][name]}

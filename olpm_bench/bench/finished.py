@@ -1,0 +1,121 @@
+"""A finished experiment: its cells and references, read once, and what tables, figures and page show of them, computed once.
+
+Reads results, renders nothing: a new metric needs no new cell.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from olpm_bench.bench import metrics, statistics
+from olpm_bench.bench.files import read_json
+from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.results import Cell, Results
+from olpm_bench.bench.summary import complete_cells, work
+
+if TYPE_CHECKING:
+    from olpm_bench.bench.config import Experiment, Scene
+
+
+class Final(NamedTuple):
+    """What the final images of a method show.
+
+    errors: by metric, one per seed; NaN without reference.
+    gain: the baseline's work-normalised variance over the method's.
+    """
+    errors: dict[str, np.ndarray]
+    work_normalised_variance: float
+    gain: statistics.Interval
+
+
+@dataclass(frozen=True)
+class FinishedScene:
+    """The cells of a scene, and what follows from their images; that is computed when it is first asked for.
+
+    cells: method -> one per seed, in the order of the TOML.
+    reference: None if the experiment does without.
+    """
+    scene: Scene
+    cells: dict[str, list[Cell]]
+    reference: Reference | None
+    baseline: str
+
+    @cached_property
+    def final(self) -> dict[str, Final]:
+        """Method -> what its final images show."""
+        images = {method: [cell.image()["mean"] for cell in cells] for method, cells in self.cells.items()}
+        works = {method: work(self.cells[method], means) for method, means in images.items()}
+        return {method: Final(self._errors(means), metrics.work_normalised_variance(means, float(works[method].seconds.mean())),
+                              statistics.gain(works[self.baseline], works[method])) for method, means in images.items()}
+
+    def _errors(self, images: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+        if self.reference is None:
+            return {name: np.full(len(images), np.nan) for name in metrics.METRICS}
+        truth = self.reference.mean
+        return {name: np.array([metric(image, truth) for image in images]) for name, metric in metrics.METRICS.items()}
+
+    def curves(self, over: str = "seconds") -> dict[str, statistics.Curve]:
+        """Method -> its L1 error over a column of the traces: charged seconds, or "spp".  There must be a reference."""
+        return {method: statistics.common_curve([np.array([line[over] for line in cell.trace], np.float64) for cell in cells],
+                                                self._l1[method]) for method, cells in self.cells.items()}
+
+    @cached_property
+    def _l1(self) -> dict[str, list[np.ndarray]]:
+        """Method -> for each seed the L1 error at each checkpoint."""
+        assert self.reference is not None
+        truth = self.reference.mean
+        return {method: [np.array([metrics.l1(image, truth) for image in cell.checkpoints()]) for cell in cells]
+                for method, cells in self.cells.items()}
+
+    @cached_property
+    def speed_ups(self) -> dict[str, statistics.Interval]:
+        """Method -> its speed-up over the baseline at equal L1, a ratio of charged seconds; empty without reference."""
+        curves = self.curves() if self.reference is not None else {}
+        return {method: statistics.speed_up(curves[self.baseline], curve) for method, curve in curves.items()
+                if method != self.baseline}
+
+
+@dataclass(frozen=True)
+class Finished:
+    """All that a report is made of."""
+    experiment: Experiment
+    results: Results
+    scenes: list[FinishedScene]
+
+    @property
+    def compared(self) -> list[FinishedScene]:
+        """The scenes with a reference."""
+        return [scene for scene in self.scenes if scene.reference is not None]
+
+    @property
+    def speed_ups(self) -> dict[str, dict[str, statistics.Interval]]:
+        """Method -> scene -> its speed-up over the baseline at equal L1; scenes without reference are left out."""
+        baseline = self.experiment.baseline_name
+        return {method.name: {scene.scene.name: scene.speed_ups[method.name] for scene in self.compared}
+                for method in self.experiment.method if method.name != baseline}
+
+    @cached_property
+    def machines(self) -> list[str]:
+        """The machines that the cells were made on, "CPU, n threads"; where no cell says so, that of the last run."""
+        cells = [cell for scene in self.scenes for group in scene.cells.values() for cell in group]
+        said = [cell.info["machine"] for cell in cells if "machine" in cell.info] or [read_json(self.results.folder / "env.json")]
+        return sorted({f"{m['cpu']}, {m['threads']} threads" if "threads" in m else m["cpu"] for m in said})
+
+
+def read(experiment: Experiment, results: Results, references: Mapping[str, Reference], any_version: bool = False) -> Finished:
+    """The experiment with all its cells.
+
+    Args:
+        references: by the name of the scene, of every scene that does not do without; any_version: as for `complete_cells`.
+
+    Raises:
+        ResultError: a cell is missing.
+    """
+    cells, baseline = complete_cells(experiment, results, any_version), experiment.baseline_name
+    return Finished(experiment, results, [
+        FinishedScene(scene, {method.name: cells[scene.name, method.name] for method in experiment.method},
+                      references[scene.name] if scene.has_reference else None, baseline) for scene in experiment.scene])
