@@ -62,8 +62,9 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
         except (KeyboardInterrupt, RuntimeError) as error:
             from olpm_bench.bench.progress import is_interrupt, reason
             if is_interrupt(error):
+                resumed = body.__name__ in RESUMED or kwargs.get("log")
                 complain("interrupted; " + ("what is complete is kept, and the same command goes on from there"
-                                            if body.__name__ in RESUMED else "the same command starts again"))
+                                            if resumed else "the same command starts again"))
                 raise typer.Exit(INTERRUPTED) from None
             if isinstance(error, NotImplementedError | RecursionError):
                 raise
@@ -392,6 +393,8 @@ def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CL
           only: Annotated[list[str], typer.Option(metavar="CHECK", help="Leave out all other checks.")] = [],  # noqa: B006
           seed: Annotated[int, typer.Option(min=0)] = 0,
           repeat: Annotated[int, typer.Option(min=1, help="Run with so many seeds, and count the false alarms.")] = 1,
+          log: Annotated[Path | None, typer.Option(metavar="FILE", help="Each run adds a line of JSON; seeds that it has are not "
+                                                   "run again, and count.")] = None,
           pictures: Annotated[Path, typer.Option(metavar="DIR", help="Where pictures of failures go.")] = Path("results/check"),
           json_: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False) -> None:
     """Examine a representation, ours or yours: is it the distribution that it says it is, does it learn, guide unbiased?"""
@@ -406,8 +409,8 @@ def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CL
     experiment_file.announce(representation)
     specification = {"type": representation, **settings(set_, ("representation",))["representation"]}
     checks, subject = suite.named(only), suite.Subject(specification, seed, declare)
-    if repeat > 1:
-        found = examination.campaign(subject, checks, repeat, pictures, quiet=json_)
+    if repeat > 1 or log:
+        found = examination.campaign(subject, checks, repeat, pictures, quiet=json_, log=log)
     else:
         found = examination.examine(subject, checks, pictures, quiet=json_)
     if json_:

@@ -1,6 +1,7 @@
 """Ten thousands of records at once: what only one of them gets wrong, or what depends on the index of a record."""
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -10,18 +11,20 @@ from scipy import stats
 
 from olpm_bench.check.density import ROUNDING, direction
 from olpm_bench.check.particles import normalised, uniform_directions, vector
+from olpm_bench.check.picture import of_density, over_disk
 from olpm_bench.check.proposal import Proposals
-from olpm_bench.check.samples import BINS, FEWEST, bin_of, chi_square
+from olpm_bench.check.samples import BINS, FEWEST, bin_of, chi_square, of_sums
 from olpm_bench.check.trained import as_numpy
-from olpm_bench.check.verdict import PValues, Verdict
+from olpm_bench.check.verdict import Panel, Picture, PValues, Verdict
 from representations.interface import ParticleBatch
 from representations.state import bytes_of
 
-RECORDS, BYTES = 1 << 15, 1 << 28       # as many records, unless their state takes more memory than this
+RECORDS, BYTES = 1 << 15, 1 << 28       # as many records, unless their states take more memory than this
 PARTICLES = 96              # of each: more than a mixture's first fit needs
 SPREAD = 0.15               # radius of a record's lobe [rad]
 DIRECTIONS = 16             # samples of each record, and as many directions of a proposal
 PACKET = 16                 # lanes
+SHOWN = 1 << 17             # samples of a record in the picture of it
 
 
 def be_many(representation: Any, seed: int, level: float) -> Verdict:
@@ -29,14 +32,14 @@ def be_many(representation: Any, seed: int, level: float) -> Verdict:
     over bins of the square, over blocks of records, and over the lanes of a packet.
     """
     rng = np.random.default_rng([4, seed])
-    n = int(np.clip(BYTES * 64 // max(bytes_of(representation.init(64)), 1), BINS**2, RECORDS))
+    n = records_that_fit(representation, RECORDS)
     axis = uniform_directions(n, rng)
     state = representation.update(representation.init(n, seed), _lobes(axis, rng), seed)
     dr.eval(state)
 
     record = rng.permutation(np.repeat(np.arange(n), DIRECTIONS))
     index, lanes = mi.UInt32(record.astype(np.uint32)), len(record)
-    proposals = Proposals([(a[None], np.ones(1)) for a in axis], rng)
+    proposals = Proposals(list(zip(axis[:, None], np.ones((n, 1)), strict=True)), rng)
     x, reported = representation.sample(state, index, mi.Float(rng.random(lanes, np.float32)),
                                         mi.Point2f(rng.random((2, lanes), np.float32)))
     dr.eval(x, reported)
@@ -51,23 +54,55 @@ def be_many(representation: Any, seed: int, level: float) -> Verdict:
         i = int(np.flatnonzero(~fine)[0])
         return Verdict(False, "wrong records", float(len(np.unique(record[~fine]))), 0.0, f"record {record[i]} of {n}: sample "
                        f"{direction(x[i])} reports {reported[i]:.5g} 1/sr, pdf() says {f_x[i]:.5g}, and {f_y[i]:.5g} at "
-                       f"{direction(y[i])}")
+                       f"{direction(y[i])}", picture=_of_record(representation, state, int(record[i])))
     q_x, q_y = proposals.pdf(record, x), proposals.pdf(record, y)
     a = np.where((reported > 0) & (x[:, 2] > 0), q_x / (q_x + f_x), 0)
     b = np.where(y[:, 2] > 0, f_y / (q_y + f_y), 0)
-    p_values, groups, lane = PValues(), BINS**2, np.arange(lanes) % PACKET
-    for what, of_x, of_y in (("bins of the square", bin_of(x), bin_of(y)), ("lanes of a packet", lane, lane),
-                             ("blocks of records", record * groups // n, record * groups // n)):
-        sampled, expected = np.bincount(of_x, a, groups), np.bincount(of_y, b, groups)
-        variance = np.bincount(of_x, a**2, groups) + np.bincount(of_y, b**2, groups)
+    # A lane's x and y are of the same record: a - b has the mean 0, and the variance E (a - b)^2.  Of blocks and lanes the
+    # numbers of terms are fixed; of bins they are not (see `chi_square`).
+    apart, block, lane, in_x, in_y = (a - b) ** 2, record * BINS**2 // n, np.arange(lanes) % PACKET, bin_of(x), bin_of(y)
+    p_values = PValues()
+    for what, of_x, of_y, squares in (("blocks of records", block, block, [(block, apart)]),
+                                      ("lanes of a packet", lane, lane, [(lane, apart)]),
+                                      ("bins of the square", in_x, in_y, [(in_x, a**2), (in_y, b**2)])):
+        sampled, expected = np.bincount(of_x, a, BINS**2), np.bincount(of_y, b, BINS**2)
+        variance = np.sum([np.bincount(index, square, BINS**2) for index, square in squares], axis=0)
         chi2, bins, worst = chi_square(sampled, expected, variance, FEWEST)
         words = (f"{n} records: chi-square {chi2:.0f} over {bins} {what}; worst is number {worst}: {sampled[worst]:.0f} sampled, "
                  f"{expected[worst]:.0f} by the pdf")
-        p_values.add(stats.chi2.sf(chi2, bins), words)
-    difference, error = a.sum() - b.sum(), np.sqrt((a**2).sum() + (b**2).sum())
-    z = abs(difference) / error
-    p_values.add(2 * stats.norm.sf(z), f"{n} records: samples and pdf differ by {difference / b.sum():+.2%}, {z:.1f} sd")
+        picture = partial(_of_groups, what, sampled, expected, variance)
+        p_values.add(stats.chi2.sf(chi2, bins), words, picture)
+    p, words = of_sums(a.sum(), b.sum(), apart.sum())
+    p_values.add(p, f"{n} records: {words}", picture)
     return p_values.verdict(level, f"{n} records, {2 * lanes} directions")
+
+
+def records_that_fit(representation: Any, most: int) -> int:
+    """As many as `most`, or as `BYTES` hold."""
+    return int(np.clip(BYTES * 64 // max(bytes_of(representation.init(64)), 1), BINS**2, most))
+
+
+def _of_record(representation: Any, state: Any, record: int) -> Picture:
+    """Its density and its samples."""
+    def panels() -> list[Panel]:
+        index, rng = dr.full(mi.UInt32, record, SHOWN), np.random.default_rng(0)
+        wo, pdf = representation.sample(state, index, mi.Float(rng.random(SHOWN, np.float32)),
+                                        mi.Point2f(rng.random((2, SHOWN), np.float32)))
+        x = np.stack([as_numpy(c, SHOWN) for c in wo], -1)[as_numpy(pdf, SHOWN) > 0]
+        return [of_density(f"pdf of record {record}", lambda wo: as_numpy(
+                    representation.pdf(state, dr.full(mi.UInt32, record, len(wo)), vector(wo)), len(wo))),
+                Panel(f"histogram of {len(x)} samples", over_disk(x, np.full(len(x), 1 / SHOWN)))]
+    return panels
+
+
+def _of_groups(what: str, sampled: np.ndarray, expected: np.ndarray, variance: np.ndarray) -> list[Panel]:
+    """Bins of the square; others are drawn in rows of as many, from the top."""
+    z = np.divide(sampled - expected, np.sqrt(variance), out=np.full(len(variance), np.nan), where=variance > 0)
+    order = -1 if what == "bins of the square" else 1
+    return [Panel(title, values.reshape(BINS, BINS)[::order], scale, unit) for title, values, scale, unit in (
+        (f"sampled, {what}", np.where(variance > 0, sampled, np.nan), "linear", "sum of weights"),
+        ("by the pdf", np.where(variance > 0, expected, np.nan), "linear", "sum of weights"),
+        ("sampled - by the pdf", z, "signed", "standard deviations"))]
 
 
 def _lobes(axis: np.ndarray, rng: np.random.Generator) -> ParticleBatch:

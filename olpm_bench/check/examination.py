@@ -1,6 +1,7 @@
 """`olpm-bench check`: one run of all checks with its table and pictures, or many runs to count the false alarms."""
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +10,8 @@ from typing import Any
 from rich.console import Console
 from scipy import stats
 
-from olpm_bench.bench.files import slug
+from olpm_bench.bench.config import own_code
+from olpm_bench.bench.files import ResultError, digest, plain, slug
 from olpm_bench.bench.progress import Bar, is_interrupt
 from olpm_bench.check import suite
 from olpm_bench.check.suite import LEVEL, Check, Outcome, Subject
@@ -41,33 +43,70 @@ def examine(subject: Subject, checks: Sequence[Check], folder: Path, quiet: bool
             "level": LEVEL, "p": suite.p_value(outcomes), "seconds": seconds, "checks": found}
 
 
-def campaign(subject: Subject, checks: Sequence[Check], runs: int, folder: Path, quiet: bool = False) -> dict[str, Any]:
-    """Run the checks with `runs` seeds from the subject's on, and count the alarms; the arguments are those of `examine`."""
-    console, found = Console(), []
-    alarms, beyond = 0, dict.fromkeys(COARSE, 0)
+def campaign(subject: Subject, checks: Sequence[Check], runs: int, folder: Path, quiet: bool = False,
+             log: Path | None = None) -> dict[str, Any]:
+    """Run the checks with `runs` seeds from the subject's on, and count the alarms; other arguments are those of `examine`.
+
+    log: a file of a JSON line a run.  Seeds that are in it are not run again; all its runs of these checks by this code count.
+    """
+    console, about = Console(), _about(subject, checks)
+    found = _logged(log, about)
     for seed in range(subject.seed, subject.seed + runs):
+        if seed in found:
+            continue
         one = Subject(subject.specification, seed, subject.declared)
         start = time.perf_counter()
         outcomes = _run(one, checks)
         failed = [o for o in outcomes if not o.verdict.passed]
         p = suite.p_value(outcomes)
-        alarms += bool(failed)
-        for level in COARSE:
-            beyond[level] += p < level
-        found.append({"seed": seed, "passed": not failed, "p": p, "failed": {o.check.name: o.verdict.worst for o in failed},
-                      "smallest": {o.check.name: o.verdict.p for o in outcomes if o.verdict.p is not None},
-                      "seconds": time.perf_counter() - start, "pictures": [
-                          str(path) for o in failed if (path := _draw(o, one, folder / f"seed{seed}")) is not None]})
+        found[seed] = plain({
+            **about, "seed": seed, "passed": not failed, "p": p, "failed": {o.check.name: o.verdict.worst for o in failed},
+            "smallest": {o.check.name: o.verdict.p for o in outcomes if o.verdict.p is not None},
+            "seconds": time.perf_counter() - start, "pictures": [
+                str(path) for o in failed if (path := _draw(o, one, folder / f"seed{seed}")) is not None]})
+        if log is not None:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            with log.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(found[seed], allow_nan=False) + "\n")
         if not quiet:
             words = "; ".join(f"{o.check.name}: {o.verdict.worst}" for o in failed)
             verdicts.line(console, f"seed {seed}: {f'FAILED {words}' if failed else f'passed, p = {p:.3g}'}")
+    found = _logged(log, about) or found            # other processes write to it, too
+    lines, n = [found[seed] for seed in sorted(found)], len(found)
+    alarms = sum(not line["passed"] for line in lines)
+    beyond = {level: sum(line["p"] < level for line in lines) for level in COARSE}
     if not quiet:
-        verdicts.line(console, f"{subject.name}: {alarms} of {runs} runs raised an alarm; at most {runs * LEVEL:.2g} expected")
+        verdicts.line(console, f"{subject.name}: {alarms} of {n} runs raised an alarm; at most {n * LEVEL:.2g} expected")
         for level, count in beyond.items():
-            verdicts.line(console, f"  p < {level}: {count} of {runs}, at most {runs * level:.3g} expected (binomial p = "
-                          f"{stats.binomtest(count, runs, level, 'greater').pvalue:.2g})")
+            verdicts.line(console, f"  p < {level}: {count} of {n}, at most {n * level:.3g} expected (binomial p = "
+                          f"{stats.binomtest(count, n, level, 'greater').pvalue:.2g})")
     return {"representation": subject.specification, "declared": list(subject.declared), "passed": alarms == 0, "level": LEVEL,
-            "alarms": alarms, "below": {str(level): count for level, count in beyond.items()}, "runs": found}
+            "alarms": alarms, "below": {str(level): count for level, count in beyond.items()}, "runs": lines}
+
+
+def _about(subject: Subject, checks: Sequence[Check]) -> dict[str, Any]:
+    """What runs have in common that count together: what is examined, by which checks, and a hash of all code that does so."""
+    files, own = sorted(Path(__file__).parent.glob("*.py")), subject.name.rpartition(":")[0]
+    code = digest(own_code().encode(), *(file.read_bytes() for file in [*files, *([Path(own)] if own else [])]))
+    return plain({"representation": subject.specification, "declared": sorted(subject.declared),
+                  "checks": [check.name for check in checks], "code": code})
+
+
+def _logged(log: Path | None, about: dict[str, Any]) -> dict[int, dict[str, Any]]:
+    """The runs in the file that are `about` the same, by their seeds.
+
+    Raises:
+        ResultError: a line that is none of ours.
+    """
+    found = {}
+    for number, line in enumerate(log.read_text(encoding="utf-8").splitlines() if log and log.exists() else [], 1):
+        try:
+            run = json.loads(line)
+            if all(run[key] == value for key, value in about.items()):
+                found[int(run["seed"])] = {**run, "passed": bool(run["passed"]), "p": float(run["p"])}
+        except (ValueError, KeyError, TypeError):
+            raise ResultError(f"{log}: line {number} is broken; remove it") from None
+    return found
 
 
 def _run(subject: Subject, checks: Sequence[Check]) -> list[Outcome]:

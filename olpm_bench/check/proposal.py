@@ -23,21 +23,22 @@ class Proposals:
     """
 
     def __init__(self, particles: Sequence[Particles], rng: np.random.Generator) -> None:
-        axes, masses = [], []
         self.complete = np.array([len(weight) <= AROUND for _, weight in particles])      # looks around all of them
+        kept = []
         for wo, weight in particles:
-            if len(wo) > AROUND:
-                kept = rng.choice(len(wo), AROUND, replace=False)
-                wo, weight = wo[kept], weight[kept]
-            axis, index = np.unique(wo, axis=0, return_inverse=True)
-            mass = np.bincount(index.ravel(), weight.astype(np.float64), len(axis))
-            even = np.full(len(axis), 1 / max(len(axis), 1))
-            axes.append(axis)
-            masses.append((even + mass / mass.sum()) / 2 if mass.sum() > 0 else even)
-        self.count = np.array([len(axis) for axis in axes])
+            some = rng.choice(len(wo), AROUND, replace=False) if len(wo) > AROUND else slice(None)
+            kept.append((wo[some], weight[some]))
+        owner = np.repeat(np.arange(len(kept)), [len(weight) for _, weight in kept])
+        owned = np.column_stack([owner, np.concatenate([wo for wo, _ in kept])])
+        axes, index = np.unique(owned, axis=0, return_inverse=True)
+        self.axis, owner = axes[:, 1:], axes[:, 0].astype(int)
+        self.count = np.bincount(owner, minlength=len(kept))
         self.first = np.cumsum(self.count) - self.count
-        self.axis, self.mass = np.concatenate(axes).astype(np.float64), np.concatenate(masses)
-        self.cumulative = np.concatenate([r + np.cumsum(mass) for r, mass in enumerate(masses)])
+        mass, even = np.bincount(index.ravel(), np.concatenate([weight for _, weight in kept]), len(axes)), 1 / self.count[owner]
+        total = np.bincount(owner, mass, len(kept))[owner]
+        self.mass = np.where(total > 0, (even + mass / np.where(total > 0, total, 1)) / 2, even)
+        below = np.cumsum(self.mass) - self.mass
+        self.cumulative = owner + (below - below[self.first[owner]] + self.mass)
 
     def around(self, record: int) -> np.ndarray:
         """Distinct particles of a record [n, 3]."""

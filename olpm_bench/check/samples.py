@@ -1,6 +1,8 @@
 """sample() realises pdf(): it reports that density, and follows it."""
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -49,46 +51,64 @@ def follow_pdf(trained: Trained, level: float) -> Verdict:
     Grids miss narrow lobes and plain Monte Carlo integrals of pdf() are heavy-tailed.  So with x from sample(), y from
     a proposal q and f = pdf(), compare in each bin B the means of 1_B q / (q + f) over x and 1_B f / (q + f) over y:
     both estimate the integral of f q / (q + f) over B if x follows f, and neither has terms above 1.
+
+    A record's x and y are independent draws, and their numbers are fixed: the variance of a mean of terms t over n of them is
+    (E t^2 - (E t)^2) / n.  So it is for the sum over all bins; in the bins E t^2 / n stands for it (see `chi_square`).
     """
     people, d, p = trained.people, trained.drawn, trained.people.proposed
     above = d.alive & (d.wo[:, 2] > 0)
     record, wo, f_x, f_y = d.record[above], d.wo[above], d.pdf[above], trained.proposed
     q_x = people.proposals.pdf(record, wo)
-    sampled, variance_x = _binned(q_x / (q_x + f_x), record, wo, people.counts)
-    expected, variance_y = _binned(f_y / (p.q + f_y), p.record, p.wo, people.counts)
-    variance, p_values = variance_x + variance_y, PValues()
+    sampled, square_x = _binned(q_x / (q_x + f_x), record, wo, people.counts)
+    expected, square_y = _binned(f_y / (p.q + f_y), p.record, p.wo, people.counts)
+    square, p_values = square_x + square_y, PValues()
+    variance = square.sum(1) - (sampled.sum(1) ** 2 + expected.sum(1) ** 2) / people.counts
     for r in range(len(people)):
-        chi2, bins, worst = chi_square(sampled[r], expected[r], variance[r], FEWEST / people.counts[r])
+        chi2, bins, worst = chi_square(sampled[r], expected[r], square[r], FEWEST / people.counts[r])
         wo = _centre(worst)
         words = f"{people.name(r)}: chi-square {chi2:.0f} for {bins} bins, worst around {direction(wo)}"
         p_values.add(stats.chi2.sf(chi2, bins), words, of_record(trained, r, wo))
     for condition in dict.fromkeys(people.conditions):
         some = [c == condition for c in people.conditions]
-        difference, error = (sampled - expected)[some].sum(), np.sqrt(variance[some].sum())
-        words = (f"all records '{condition}': samples and pdf differ by {difference / expected[some].sum():+.2%}, "
-                 f"{abs(difference) / error:.1f} standard deviations")
-        p_values.add(2 * stats.norm.sf(abs(difference) / error), words, of_record(trained, some.index(True)))
+        p_value, words = of_sums(sampled[some].sum(), expected[some].sum(), variance[some].sum())
+        p_values.add(p_value, f"all records '{condition}': {words}", of_record(trained, some.index(True)))
     return p_values.verdict(level, f"{len(q_x) + len(f_y)} directions")
 
 
 def _binned(terms: np.ndarray, record: np.ndarray, wo: np.ndarray, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means over a record's trials of the terms in each bin, and the variances of these means [n_records, BINS^2]."""
+    """Means over a record's trials of the terms in each bin, and of their squares over the trials [n_records, BINS^2]."""
     index, shape, trials = record * BINS**2 + bin_of(wo), (len(trials), BINS**2), trials[:, None]
     mean, square = (np.bincount(index, t, shape[0] * shape[1]).reshape(shape) / trials for t in (terms, terms**2))
-    return mean, (square - mean**2) / trials
+    return mean, square / trials
 
 
 def chi_square(sampled: np.ndarray, expected: np.ndarray, variance: np.ndarray, fewest: float) -> tuple[float, int, int]:
     """Of two estimates a bin; bins with less than `fewest` in both are pooled, so that sums are close to normal.
 
+    Where a term falls into one bin of many, the estimates of two bins are correlated.  With p and s the means of terms and of
+    their squares in the bins, the covariance of the sums over n terms is n (diag(s) - p p^T), which n diag(s) exceeds by a
+    matrix that is not negative: with s for the variance the statistic is at most chi-square.  What that loses is close to one
+    degree of freedom, the sum over all bins, which `of_sums` tests.
+
     Returns:
-        The statistic, its degrees of freedom, and a bin that differs most.
+        The statistic, its degrees of freedom (bins with anything in them), and a bin that differs most.
     """
     group = np.where(sampled + expected < fewest, 0, np.arange(1, len(sampled) + 1))
     group = np.unique(group, return_inverse=True)[1]
     a, b, v = (np.bincount(group, t) for t in (sampled, expected, variance))
-    z2 = (a - b) ** 2 / np.maximum(v, 1e-30)
-    return float(z2.sum()), len(z2), int(np.flatnonzero(group == np.argmax(z2))[0])
+    z2 = _beyond_rounding(a, b) ** 2 / np.maximum(v, 1e-30)
+    return float(z2.sum()), max(int(np.count_nonzero(v)), 1), int(np.flatnonzero(group == np.argmax(z2))[0])
+
+
+def of_sums(sampled: float, expected: float, variance: float) -> tuple[float, str]:
+    """p-value, and words, of two sums of many terms whose difference has this variance."""
+    z, relative = _beyond_rounding(sampled, expected) / np.sqrt(max(variance, 1e-30)), (sampled - expected) / max(expected, 1e-30)
+    return 2 * float(stats.norm.sf(z)), f"samples and pdf differ by {relative:+.2%}, {z:.1f} standard deviations"
+
+
+def _beyond_rounding(sampled: Any, expected: Any) -> Any:
+    """How far they are apart, less what float32 is forgiven."""
+    return np.maximum(np.abs(sampled - expected) - ROUNDING * expected, 0)
 
 
 def bin_of(wo: np.ndarray) -> np.ndarray:

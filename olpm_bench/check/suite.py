@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from olpm_bench.check import crowd, density, learning, memory, purity, samples, unbiased
+from olpm_bench.check import crowd, density, kernel, learning, memory, purity, samples, unbiased
 from olpm_bench.check.population import population, population_with_parallax
 from olpm_bench.check.trained import Trained
 from olpm_bench.check.verdict import Verdict, combined, sidak
@@ -76,8 +76,12 @@ CHECKS = (
           lambda s, level: density.integral(s.trained, level), statistical=True),
     Check("reported-pdf", "sample returns the density that pdf gives", lambda s, _: samples.report_pdf(s.trained)),
     Check("samples", "samples follow the pdf", lambda s, level: samples.follow_pdf(s.trained, level), statistical=True),
+    Check("one-particle", "around a single particle, samples follow the pdf",
+          lambda s, level: kernel.keep_balance(s.representation, s.seed, level), statistical=True),
     Check("inactive-lanes", "lanes that are switched off change nothing", lambda s, _: samples.mind_active(s.trained)),
     Check("parallax-density", "as density, asked from beside the record", lambda s, _: density.is_valid(s.aimed)),
+    Check("parallax-integral", "as integral, asked from beside the record",
+          lambda s, level: density.integral(s.aimed, level), statistical=True),
     Check("parallax-reported", "as reported-pdf, asked from beside the record", lambda s, _: samples.report_pdf(s.aimed)),
     Check("parallax-samples", "as samples, asked from beside the record",
           lambda s, level: samples.follow_pdf(s.aimed, level), statistical=True),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import drjit as dr
 import numpy as np
+import pytest
 
 from olpm_bench.bench import experiment_file, run
 from olpm_bench.bench.config import Experiment
@@ -15,14 +16,8 @@ from olpm_bench.bench.results import Results
 
 TOML = """
 title = "Repeatable"
-seeds = 2
 [budget]
 spp = 11
-[[scene]]
-name = "cornell_box"
-width = 16
-height = 12
-reference = "none"
 [[scene]]
 name = "lamps"
 file = "scene.xml"
@@ -36,9 +31,30 @@ importons = 10_000
 camera_passes = 2
 camera_paths = 4096
 record_radius = 0.2
+"""
+GMM = """
+[[scene]]
+name = "cornell_box"
+width = 16
+height = 12
+reference = "none"
 [[method]]
 name = "GMM"
 representation = { type = "gaussian_mixture" }
+"""
+OTHERS = """
+[[method]]
+name = "Path tracing"
+[[method]]
+name = "GMM, paper2014"
+representation = { type = "gaussian_mixture" }
+training = { preset = "paper2014", passes = 2, photons = 20_000, importons = 10_000, record_radius = 0.2 }
+[[method]]
+name = "Jensen"
+representation = { type = "jensen" }
+[[method]]
+name = "Hey"
+representation = { type = "hey" }
 """
 
 # A floor lit by eight cubes.  Which of them next-event estimation samples goes by their order: that of the file, unless a loader
@@ -63,14 +79,17 @@ assert run.run(experiment_file.load(Path(sys.argv[1])), Path(sys.argv[2])) == []
 """
 
 
-def test_images_repeat_in_another_process_on_other_threads_and_resumed(tmp_path: Path):
+@pytest.mark.parametrize(("seeds", "methods"), [pytest.param([0, 1], GMM, id="GMM"),
+                                                pytest.param([1], OTHERS, id="others", marks=pytest.mark.slow)])
+def test_images_repeat_in_another_process_on_other_threads_and_resumed(tmp_path: Path, seeds: list[int], methods: str):
     (tmp_path / "scene.xml").write_text(SCENE)
-    (tmp_path / "test.toml").write_text(TOML)
+    (tmp_path / "test.toml").write_text(f"seeds = {seeds}" + TOML + methods)
     experiment, root = experiment_file.load(tmp_path / "test.toml"), tmp_path / "results"
     assert run.run(experiment, root) == []
     images = _images(experiment, root)
-    for scene in ("cornell_box", "lamps"):
-        (Results(root / "test").cell_folder(scene, "GMM", 1) / "cell.json").unlink()
+    for cell in experiment.cells():
+        if cell.seed == 1:
+            (Results(root / "test").cell_folder(cell.scene.name, cell.method.name, cell.seed) / "cell.json").unlink()
     environment = {**os.environ, "PYTHONHASHSEED": "5", "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", CHILD, tmp_path / "test.toml", root, str(dr.thread_count() + 1)], env=environment,
                    check=True, capture_output=True, text=True)
@@ -82,4 +101,4 @@ def test_images_repeat_in_another_process_on_other_threads_and_resumed(tmp_path:
 def _images(experiment: Experiment, root: Path) -> dict[str, np.ndarray]:
     cells = [Results(root / "test").verified_cell(c.scene.name, c.method.name, c.seed) for c in experiment.cells()]
     assert all(cells)
-    return {f"{cell.scene}, seed {cell.seed}": cell.image()["mean"] for cell in cells}
+    return {f"{cell.scene}, {cell.method}, seed {cell.seed}": cell.image()["mean"] for cell in cells}

@@ -102,6 +102,13 @@ def test_a_failure_has_words_a_picture_and_an_exit_code(tmp_path: Path) -> None:
     assert picture.name == "scale.png" and str(picture) in result.stdout.replace("\n", "")
 
 
+@pytest.mark.parametrize(("mutant", "words"), [("UntrainedTwoPercent", "samples and pdf differ by -2"), ("OneNaN", "record ")])
+def test_ten_thousands_of_records_have_a_picture(tmp_path: Path, mutant: str, words: str) -> None:
+    result = call(f"{MUTANTS}:{mutant}", "--only", "many-records", "--pictures", tmp_path)
+    picture, = tmp_path.rglob("*.png")
+    assert result.exit_code == 1 and words in result.stdout and picture.name == "many-records.png"
+
+
 def test_a_declaration_is_believed_only_if_it_is_true() -> None:
     assert call("cosine", "--only", "learning").exit_code == 1
     assert call("cosine", "--only", "learning", "--declare", "constant").exit_code == 0
@@ -127,6 +134,29 @@ def test_an_interrupt_while_a_failure_is_drawn_is_none_of_other_peoples_errors(t
     monkeypatch.setattr(suite, "run", lambda subject, checks: iter([suite.Outcome(checks[0], failure, 0.0)]))
     result = call("jensen", "--only", "memory", "--pictures", tmp_path)
     assert result.exit_code == 130 and "interrupted" in result.stderr
+
+
+def test_a_campaign_goes_on_from_its_log(tmp_path: Path) -> None:
+    log, mine = tmp_path / "logs/jensen.jsonl", tmp_path / "mine.py"
+    mine.write_text("from representations.jensen import JensenHistogram\n\nclass Mine(JensenHistogram): pass\n")
+
+    def campaign(*arguments: object) -> list[str]:
+        result = call(f"{mine}:Mine", "--only", "scale", "--log", log, *arguments)
+        assert result.exit_code == 0, result.output
+        return result.stdout.splitlines()
+
+    assert [line[:6] for line in campaign("--repeat", 2)[:2]] == ["seed 0", "seed 1"]
+    seed, total, *_ = campaign("--repeat", 2, "--seed", 1)
+    assert seed.startswith("seed 2: passed") and "0 of 3 runs raised an alarm" in total
+    assert json.loads(call(f"{mine}:Mine", "--only", "scale", "--log", log, "--json").stdout)["runs"] == [
+        json.loads(line) for line in log.read_text().splitlines()]
+    assert campaign("--only", "memory")[0].startswith("seed 0")            # other checks, or other code, are other runs
+    mine.write_text(mine.read_text() + "# changed\n")
+    seed, total, *_ = campaign("--seed", 9)
+    assert seed.startswith("seed 9") and "0 of 1 runs" in total and len(log.read_text().splitlines()) == 5
+    log.write_text(log.read_text() + '{"seed": 1')
+    result = call(f"{mine}:Mine", "--log", log)
+    assert result.exit_code == 2 and "line 6 is broken" in result.stderr
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

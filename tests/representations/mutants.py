@@ -34,6 +34,16 @@ class PdfTimesTwoPercent(JensenHistogram):
         return 1.02 * super()._density(*args)
 
 
+class UntrainedTwoPercent(CosineLobe):
+    """2 % too much, where nothing has been learnt."""
+    def sample(self, *args, **kwargs):
+        wo, pdf = super().sample(*args, **kwargs)
+        return wo, 1.02 * pdf
+
+    def pdf(self, *args, **kwargs):
+        return 1.02 * super().pdf(*args, **kwargs)
+
+
 class PdfTimesTen(CosineLobe):
     """Ten times too much."""
     def sample(self, *args, **kwargs):
@@ -74,14 +84,7 @@ class NegativeAtTheRim(JensenHistogram):
 # ---------------------------------------------------------------------------------------------- samples
 
 class DiskForCone(HeyCones):
-    """Uniform on the cone's projected disk, with the density of a cone uniform in solid angle (as the original has it).
-
-    Cones three times as wide, where the horizon allows: of narrow ones the disk is nearly the same cap.
-    """
-    def _chord2(self, axis, used, n_records):
-        widest = 2 * dr.square(axis.z) / (1 + dr.safe_sqrt(1 - dr.square(axis.z)))
-        return dr.minimum(9 * super()._chord2(axis, used, n_records), widest)
-
+    """Uniform on the cone's projected disk, with the density of a cone uniform in solid angle (as the original has it)."""
     def sample(self, state, record, sample1, sample2, active=True, at=None):
         total = discrete.total(state.cumulative, self.cones, record, active)
         chosen = discrete.choose(state.cumulative, self.cones, record, sample1 * total, active)
@@ -170,6 +173,42 @@ class ParallaxInSamplesOnly(HeyCones):
     """pdf() doesn't mind from where it is asked."""
     def pdf(self, state, record, wo, active=True, at=None):
         return super().pdf(state, record, wo, active)
+
+
+class ParallaxBelowTheHorizon(CosineLobe):
+    """Asked from beside the record, pdf() forgets the horizon."""
+    def pdf(self, state, record, wo, active=True, at=None):
+        return cosine_pdf(wo) if at is None else dr.abs(wo.z) * dr.inv_pi
+
+
+class ParallaxTenPercent(HeyCones):
+    """10 % too much where it is asked from beside the record, in sample() and pdf() alike."""
+    def _density(self, state, record, wo, total, active, at):
+        return super()._density(state, record, wo, total, active, at) * (1 if at is None else 1.1)
+
+
+class ParallaxNotReported(HeyCones):
+    """sample() reports the density as it is at the record."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        wo, _ = super().sample(state, record, sample1, sample2, active, at)
+        return wo, super().pdf(state, record, wo, active)
+
+
+# ---------------------------------------------------------------------------------------------- images
+
+class PdfTenPercentOfTrained(JensenHistogram):
+    """pdf() is 10 % too large for records that have learnt something; sample() reports the right density."""
+    def pdf(self, state, record, wo, active=True, at=None):
+        learnt = discrete.total(state.cumulative, self.bins, record, active) > 0
+        return super().pdf(state, record, wo, active, at) * dr.select(learnt, 1.1, 1)
+
+
+class OneSideNeverSampled(JensenHistogram):
+    """Of trained records only directions with x > 0 are sampled; all have their density."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        wo, _ = super().sample(state, record, sample1, sample2, active, at)
+        wo.x = dr.select(discrete.total(state.cumulative, self.bins, record, active) > 0, dr.abs(wo.x), wo.x)
+        return wo, super().pdf(state, record, wo, active, at)
 
 
 # ---------------------------------------------------------------------------------------------- updates
@@ -272,11 +311,14 @@ class FailsToRun(CosineLobe):
 
 
 CAUGHT_BY = {
-    WrongJacobian: "samples", PdfTimesTwoPercent: "samples", PdfTimesTen: "integral", WeightsUnnormalised: "samples",
+    WrongJacobian: "samples", PdfTimesTwoPercent: "samples",
+    UntrainedTwoPercent: "samples", PdfTimesTen: "integral", WeightsUnnormalised: "samples",
     HorizonForgotten: "density", OneNaN: "many-records", NegativeAtTheRim: "density",
-    DiskForCone: "samples", SamplesBelowHorizon: "reported-pdf", NumbersIgnored: "samples", NumbersShared: "samples",
+    DiskForCone: "one-particle", SamplesBelowHorizon: "reported-pdf", NumbersIgnored: "samples", NumbersShared: "samples",
     LastBinLost: "samples", NextBin: "samples", NeighboursPdf: "samples", StaleSamples: "samples", ReportsAnother: "reported-pdf",
     FailsAboveHorizon: "reported-pdf", LanesCounted: "inactive-lanes", ParallaxInSamplesOnly: "parallax-samples",
+    ParallaxBelowTheHorizon: "parallax-density", ParallaxTenPercent: "parallax-integral",
+    ParallaxNotReported: "parallax-reported", PdfTenPercentOfTrained: "furnace", OneSideNeverSampled: "image",
     InPlace: "purity", SeedIgnored: "purity", ScaleMatters: "scale", OrderMatters: "independence",
     NeighboursListen: "independence", NothingIsNews: "nothing-new", FirstRecordsOnly: "new-records", LearnsNothing: "learning",
     Unlearns: "learning", MemoryGrows: "memory", FailsToRun: "density",

@@ -15,7 +15,16 @@ def outcome(mutant: type, check: str) -> suite.Outcome:
     return found
 
 
-@pytest.mark.parametrize(("mutant", "check"), mutants.CAUGHT_BY.items(), ids=lambda v: getattr(v, "__name__", v))
+RENDERS = ("furnace", "image")          # slow ones
+
+
+def test_every_check_rejects_something() -> None:
+    assert set(mutants.CAUGHT_BY.values()) == {check.name for check in suite.CHECKS}
+
+
+@pytest.mark.parametrize(("mutant", "check"), [
+    pytest.param(mutant, check, marks=[pytest.mark.slow] * (check in RENDERS), id=f"{mutant.__name__}-{check}")
+    for mutant, check in mutants.CAUGHT_BY.items()])
 def test_a_mutant_is_rejected(mutant: type, check: str) -> None:
     verdict = outcome(mutant, check).verdict
     assert not verdict.passed

@@ -1,6 +1,7 @@
 """A room full of spheres, each with another BSDF and its own block of pixels, under any of Mitsuba's emitters."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -91,9 +92,11 @@ EMITTERS = {
 }
 
 
-def scene(*emitters: str) -> mi.Scene:
-    """An open box, the spheres before its back wall, and a camera that sees a sphere in each block of `CELL` x `CELL` pixels."""
-    rows = -(-len(BSDFS) // COLUMNS)
+def scene(emitters: Sequence[str], bsdfs: Sequence[str] = tuple(BSDFS)) -> mi.Scene:
+    """An open box, spheres of these BSDFs before its back wall, and a camera that sees a sphere in each block of `CELL` x `CELL`
+    pixels.
+    """
+    rows = -(-len(bsdfs) // COLUMNS)
     width, height = COLUMNS * PITCH / 2, rows * PITCH / 2               # half the room's
     room = max(width, height) + 0.01
     back, middle, up = 0.4, 0.4 - room, room - height
@@ -101,10 +104,10 @@ def scene(*emitters: str) -> mi.Scene:
         ((0, back, 0), (0, -1, 0)), ((0, back - 2 * room, 0), (0, 1, 0)), ((0, middle, -height), (0, 0, 1)),
         ((-width, middle, up), (1, 0, 0)), ((width, middle, up), (-1, 0, 0))))}
     spheres = {}
-    for i, bsdf in enumerate(BSDFS.values()):
+    for i, bsdf in enumerate(bsdfs):
         centre = [(i % COLUMNS + 0.5) * PITCH - width, 0, height - (i // COLUMNS + 0.5) * PITCH]
         turned = mi.ScalarTransform4f().translate(centre).rotate((2 / 3, 1 / 3, 2 / 3), 40 * i).scale(RADIUS)
-        spheres[f"sphere{i}"] = {"type": "sphere", "to_world": turned, "bsdf": bsdf()}
+        spheres[f"sphere{i}"] = {"type": "sphere", "to_world": turned, "bsdf": BSDFS[bsdf]()}
     film = {"type": "hdrfilm", "width": COLUMNS * CELL, "height": rows * CELL, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = mi.ScalarTransform4f().look_at((0, -1.9, 0), (0, 0, 0), (0, 0, 1)) @ mi.ScalarTransform4f().scale((width, width, 1))
     camera = {"type": "orthographic", "film": film, "sampler": {"type": "independent"}, "to_world": view}

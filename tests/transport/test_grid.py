@@ -1,12 +1,15 @@
 """Unbiased whatever scatters and whatever shines: every BSDF under every emitter, unguided and guided by each representation.
 
 Each BSDF has a block of pixels, which Welch's t-test compares with Mitsuba's `path`: the block's mean, and those of its quarters.
-By default all emitters shine at once.  `pytest -m slow tests/transport/test_grid.py --grid` lets them shine one after the other,
-with four times the samples; `-rP` prints which bias would have been seen (README, "What is checked").
+A scene has one environment: by default `sunsky` and all local emitters shine at once, and `constant` and `envmap` alone, on a few
+BSDFs.  `pytest -m slow tests/transport/test_grid.py --grid` lets each emitter shine alone on all BSDFs, with four times the
+samples; `-rP` prints which bias would have been seen (README, "What is checked").
 """
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -25,31 +28,47 @@ TRAINING = {"passes": 2, "photons": 50_000, "importons": 20_000, "record_radius"
 DEPTH = 6
 PASSES, SPP = 32, 64
 LEVEL = 0.01                # probability that all tests together fail although nothing is wrong
-ENVIRONMENTS = ("constant", "envmap", "sunsky")        # of which a scene can have one
-TOGETHER = tuple(name for name in EMITTERS if name not in ENVIRONMENTS[:2])
 METHODS = ("unguided", *representations.names())
-TESTS = 5 * len(BSDFS) * len(METHODS)                   # the block and its quarters
+
+
+class Room(NamedTuple):
+    """What shines, on which BSDFs, and what is compared there with `path`."""
+    emitters: tuple[str, ...]
+    bsdfs: tuple[str, ...] = tuple(BSDFS)
+    methods: tuple[str, ...] = METHODS
+
+
+FEW = ("diffuse", "conductor", "roughconductor", "dielectric", "plastic", "mask")
+TOGETHER = Room(tuple(name for name in EMITTERS if name not in ("constant", "envmap")))
+MOST = tuple(method for method in METHODS if method != "gaussian_mixture")     # which test_path.py has under each emitter
+ROOMS = {"constant": Room(("constant",), FEW, MOST), "envmap": Room(("envmap",), FEW, MOST), "the others": TOGETHER}
+ALONE = {name: Room((name,)) for name in EMITTERS}
+
+
+def number_of_tests(rooms: Iterable[Room]) -> int:
+    """A block and its quarters for each BSDF and method."""
+    return 5 * sum(len(room.bsdfs) * len(room.methods) for room in rooms)
+
 
 pytestmark = pytest.mark.slow
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Emitter by emitter, so that what is rendered for one serves all methods."""
-    if "emitters" in metafunc.fixturenames:
-        alone = metafunc.config.getoption("--grid")
-        lights = {name: (name,) for name in EMITTERS} if alone else {"all emitters": TOGETHER}
-        cases = {f"{name}-{method}": (emitters, method) for name, emitters in lights.items() for method in METHODS}
-        metafunc.parametrize(("emitters", "method"), cases.values(), ids=cases)
+    if "room" in metafunc.fixturenames:
+        rooms = ALONE if metafunc.config.getoption("--grid") else ROOMS
+        cases = {f"{name}-{method}": (room, method) for name, room in rooms.items() for method in room.methods}
+        metafunc.parametrize(("room", "method"), cases.values(), ids=cases)
 
 
 class Blocks:
     """Means over the blocks of pixels in n passes: [n, BSDF] and of their quarters [n, 4 * BSDF]."""
 
-    def __init__(self, images: np.ndarray) -> None:
+    def __init__(self, images: np.ndarray, bsdfs: tuple[str, ...]) -> None:
         assert np.isfinite(images).all() and (images >= 0).all()
-        self.whole = blocks(images, CELL)[:, :len(BSDFS)]
+        self.bsdfs, self.whole = bsdfs, blocks(images, CELL)[:, :len(bsdfs)]
         quarters = blocks(images, CELL // 2).reshape(len(images), -1, 2, COLUMNS, 2).swapaxes(2, 3)
-        self.quarters = quarters.reshape(len(images), -1)[:, :4 * len(BSDFS)]
+        self.quarters = quarters.reshape(len(images), -1)[:, :4 * len(bsdfs)]
 
 
 class Comparison:
@@ -64,6 +83,7 @@ class Comparison:
 
     def __init__(self, ours: Blocks, theirs: Blocks, tests: int) -> None:
         self.level = 1 - (1 - LEVEL) ** (1 / tests)
+        self.bsdfs = ours.bsdfs
         whole = stats.ttest_ind(ours.whole, theirs.whole, equal_var=False)
         quarters = stats.ttest_ind(ours.quarters, theirs.quarters, equal_var=False)
         self.p = np.minimum(whole.pvalue, quarters.pvalue.reshape(-1, 4).min(1))
@@ -76,40 +96,41 @@ class Comparison:
     @property
     def rejected(self) -> dict[str, str]:
         """The BSDFs where the two differ, and by how much."""
-        return {name: line for name, line, p in zip(BSDFS, self.lines(), self.p, strict=True) if p < self.level}
+        return {name: line for name, line, p in zip(self.bsdfs, self.lines(), self.p, strict=True) if p < self.level}
 
     def lines(self) -> list[str]:
         return [f"{name:28} off by {bias:+7.2%}, p = {p:8.2g}; a bias of {seen:6.2%} would be seen"
-                for name, bias, p, seen in zip(BSDFS, self.bias, self.p, self.seen, strict=True)]
+                for name, bias, p, seen in zip(self.bsdfs, self.bias, self.p, self.seen, strict=True)]
 
 
 @lru_cache(maxsize=1)
-def lit_by(emitters: tuple[str, ...]) -> mi.Scene:
-    return scene(*emitters)
+def lit(room: Room) -> mi.Scene:
+    return scene(room.emitters, room.bsdfs)
 
 
 @lru_cache(maxsize=1)
-def by_mitsuba(emitters: tuple[str, ...], spp: int) -> Blocks:
-    return Blocks(passes(lit_by(emitters), mi.load_dict({"type": "path", "max_depth": DEPTH}), PASSES, spp, seed=1000))
+def by_mitsuba(room: Room, spp: int) -> Blocks:
+    images = passes(lit(room), mi.load_dict({"type": "path", "max_depth": DEPTH}), PASSES, spp, seed=1000)
+    return Blocks(images, room.bsdfs)
 
 
 @lru_cache(maxsize=len(METHODS))
-def trained(emitters: tuple[str, ...], representation: str):
-    guide = olpm_bench.train(lit_by(emitters), representation, max_depth=DEPTH, **TRAINING)
+def trained(room: Room, representation: str):
+    guide = olpm_bench.train(lit(room), representation, max_depth=DEPTH, **TRAINING)
     assert guide.trained > 0.3
     return guide
 
 
-def compare(emitters: tuple[str, ...], method: str, tests: int, spp: int) -> Comparison:
-    guide = trained(emitters, method) if method != "unguided" else None
+def compare(room: Room, method: str, tests: int, spp: int) -> Comparison:
+    guide = trained(room, method) if method != "unguided" else None
     integrator = olpm_bench.integrator(guide, max_depth=DEPTH)
-    return Comparison(Blocks(passes(lit_by(emitters), integrator, PASSES, spp)), by_mitsuba(emitters, spp), tests)
+    return Comparison(Blocks(passes(lit(room), integrator, PASSES, spp), room.bsdfs), by_mitsuba(room, spp), tests)
 
 
-def test_every_bsdf_under_every_emitter(emitters, method, request):
-    alone = request.config.getoption("--grid")
-    found = compare(emitters, method, *((TESTS * len(EMITTERS), 4 * SPP) if alone else (TESTS, SPP)))
-    print(f"{', '.join(emitters)}; {method}:", *found.lines(), sep="\n")
+def test_every_bsdf_under_every_emitter(room, method, request):
+    rooms, spp = (ALONE, 4 * SPP) if request.config.getoption("--grid") else (ROOMS, SPP)
+    found = compare(room, method, number_of_tests(rooms.values()), spp)
+    print(f"{', '.join(room.emitters)}; {method}:", *found.lines(), sep="\n")
     assert not found.rejected, "\n".join(found.rejected.values())
     assert np.median(found.seen) < 0.1
 
@@ -137,6 +158,6 @@ def _specular_weight(patch: pytest.MonkeyPatch) -> None:
 def test_wrong_integrators_are_caught(mutation, caught, monkeypatch):
     trained(TOGETHER, "gaussian_mixture")
     mutation(monkeypatch)
-    found = compare(TOGETHER, "gaussian_mixture", TESTS, SPP)
+    found = compare(TOGETHER, "gaussian_mixture", number_of_tests(ROOMS.values()), SPP)
     print(mutation.__doc__, *found.lines(), sep="\n")
     assert caught <= found.rejected.keys(), "\n".join(found.lines())

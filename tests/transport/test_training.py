@@ -51,6 +51,7 @@ def test_guides_learn_on_line(scene, name):
 
 
 @pytest.mark.parametrize(("name", "changes"), [("jensen", {}), ("gaussian_mixture", {}), ("gaussian_mixture", SHRINKING),
+                                               ("gaussian_mixture", {**SHRINKING, "gather": "nearest"}),
                                                ("gaussian_mixture", PARALLAX), ("hey", PARALLAX)])
 def test_training_repeats_bit_for_bit_whatever_the_threads(scene, name, changes):
     threads = dr.thread_count()

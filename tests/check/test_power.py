@@ -1,0 +1,61 @@
+"""Comparisons of samples with densities: their p-values are uniform if nothing is wrong, and what they find."""
+from __future__ import annotations
+
+import mutants
+import numpy as np
+import pytest
+from scipy import stats
+
+from olpm_bench.check import crowd, population, samples
+from olpm_bench.check.particles import equal, lobes, nothing
+from olpm_bench.check.trained import Trained
+from olpm_bench.check.verdict import PValues
+from representations.cosine import CosineLobe
+from representations.jensen import JensenHistogram
+
+SEEDS, LEVEL = 24, 1e-3
+
+
+@pytest.fixture
+def p_values(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float]]:
+    """All p-values that the checks find, by what their words begin with; nothing is forgiven, and there are fewer samples."""
+    found: dict[str, list[float]] = {"sum": [], "lanes": [], "blocks": [], "bins": []}
+
+    def add(self, p, words, picture=None):
+        kind = next((k for k in found if f"{k} of" in words), "sum" if "differ by" in words else "bins")
+        found[kind].append(p)
+        self.found.append((p, words, picture))
+
+    monkeypatch.setattr(PValues, "add", add)
+    monkeypatch.setattr(samples, "ROUNDING", 0.0)
+    monkeypatch.setattr(population, "FEW", 1 << 13)
+    monkeypatch.setattr(population, "SAMPLES", 1 << 13)
+    monkeypatch.setattr(crowd, "RECORDS", 1 << 12)
+    return found
+
+
+def small_population(seed: int) -> population.Population:
+    rng = np.random.default_rng(seed)
+    particles = [nothing(), nothing(), equal(lobes(1, rng)), equal(lobes(9, rng)), equal(lobes(200, rng))]
+    return population.Population(["untrained", "untrained", "one", "nine", "many"], [particles], seed)
+
+
+@pytest.mark.parametrize("representation", [CosineLobe(), JensenHistogram()], ids=["cosine", "jensen"])
+def test_p_values_are_uniform_if_nothing_is_wrong(representation, p_values) -> None:
+    """Those of sums, lanes and blocks; those of bins are no smaller (they are of bounds on the variance)."""
+    for seed in range(SEEDS):
+        samples.follow_pdf(Trained(representation, small_population(seed)), 0.01)
+        if seed % 3 == 0:
+            crowd.be_many(representation, seed, 0.01)
+    for kind in ("sum", "lanes", "blocks"):
+        assert stats.kstest(p_values[kind], "uniform").pvalue > LEVEL, (kind, np.sort(p_values[kind]))
+    assert len(p_values["sum"]) == 4 * SEEDS + SEEDS // 3
+    assert stats.kstest(p_values["bins"], "uniform", alternative="greater").pvalue > LEVEL
+
+
+def test_two_percent_are_found_in_few_samples(p_values) -> None:
+    """Of 16,384 samples by their sum, and no bin shows it; of 65,536 in many records."""
+    samples.follow_pdf(Trained(mutants.UntrainedTwoPercent(), small_population(0)), 0.01)
+    assert p_values["sum"][0] < 1e-9 and min(p_values["bins"]) > 1e-3
+    crowd.be_many(mutants.UntrainedTwoPercent(), 0, 0.01)
+    assert p_values["sum"][-1] < 1e-4 and min(p_values["bins"]) > 1e-3
