@@ -54,7 +54,7 @@ name = "GMM"
 representation = { type = "gaussian_mixture", components = 4 }
 """
 KINDS = ("CPU time", "write", "unfinished file")
-TIMES = ("seconds", "fraction", "compile", "machine", "passes")     # what in a cell.json depends on the machine
+TIMES = ("seconds", "fraction", "compile", "machine", "passes", "training_ended")     # what in a cell.json depends on the machine
 
 
 class Run:
