@@ -285,11 +285,11 @@ class Training:
                     guide.learn_camera(batch, *paths.returned(place), offset, self._next_seed())
                 statistics.seen = float(np.mean(guide.count.numpy()[np.diff(offset.numpy().astype(np.int64)) > 0]))
             statistics.kept = len(batch)
-            if dr.max(image.array)[0] == 0:
-                statistics.warnings.append("no camera path has met light: it may not enter what the camera sees")
         else:
             statistics.warnings.append("the camera sees no surface: there is nothing to guide")
         self._estimate_pixels(image, spp)
+        if len(vertices) and not np.any(self.luminance):
+            statistics.warnings.append("no camera path has met light: it may not enter what the camera sees")
         statistics.spp, statistics.stored, statistics.image = spp, len(vertices), image
         statistics.records = guide.records
         return statistics
