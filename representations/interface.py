@@ -126,8 +126,7 @@ def offsets(key: mi.UInt32, n_keys: int) -> mi.UInt32:
 
 
 class DirectionalPdf(Protocol[State]):
-    """Four verbs.  `tests/representations/test_conformance.py` checks that `sample` and `pdf` are one distribution, and more:
-    ``pytest tests/representations/test_conformance.py --representation path/to/file.py:ClassName``.
+    """Four verbs.  ``olpm-bench check path/to/file.py:ClassName`` checks that `sample` and `pdf` are one distribution, and more.
     """
 
     def init(self, n_records: int, seed: int = 0, parallax: bool = False) -> State:

@@ -23,9 +23,8 @@ import numpy as np
 from olpm_bench.transport.camera_paths import wanted
 from olpm_bench.transport.gather import Gathered
 from olpm_bench.transport.guide import Guide
-from olpm_bench.transport.guided_bsdf import GuidedBSDF
-from olpm_bench.transport.particles import UNBOUNDED_DEPTH
-from olpm_bench.transport.settings import InputError, IntegratorSettings
+from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
+from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError, IntegratorSettings
 from representations import square
 
 BINS = 64               # along an edge of the square: 1.5 msr, 2.2 degrees
@@ -99,7 +98,7 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, pixel: tuple[int, int], max_depth:
         si = scene.ray_intersect(ray)
         if not si.is_valid()[0]:
             return
-        n = dr.mulsign(si.n, -dr.dot(si.n, ray.d))
+        n = incident_normal(si)
         o, d, p, z, mirror = (np.array([x[0] for x in v]) for v in (ray.o, ray.d, si.p, n, si.to_world(mi.reflect(si.wi))))
         bsdf, name, axes = si.bsdf(ray), si.shape[0].id() or "an unnamed shape", frame(z, d, up)
         yield Vertex(number, o, d, p, axes, axes @ mirror, bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)[0]), name)

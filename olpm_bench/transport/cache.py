@@ -40,7 +40,8 @@ LEVELS = 3                      # times that a cell can be split
 CHILDREN = 32
 NEIGHBOURS = 8                  # nearest records among which the best for a cell is sought
 LEAST = 2                       # fewer new cells or records wait: Dr.Jit compiles arrays of one entry to other kernels
-FEW = 100                       # points that are still new after others have been served wait
+FEW = 100                       # points that are still new after others have been served wait, ...
+RARE = 1000                     # ... and those that are less than one of so many: to add a record costs as much as to add many
 SMALLEST_RADIUS = 1e-15         # r_max [scene units], and 1 / the largest
 MOST_CELLS = 2 ** 27            # of a table: 512 MB
 MOST_RECORDS = 2 ** 17
@@ -195,10 +196,10 @@ class RecordCache:
 
     def grow(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> int:
         """Add records for the points that have none; returns how many.  Existing records keep their index."""
-        before = len(self)
+        before, few = len(self), max(LEAST, dr.width(p) // RARE)
         for i in range(LEVELS + 1):             # a cell may have to be split, and its child, and so on
             new = dr.compress(self._is_new(p, n, active))
-            if len(new) < (FEW if i else LEAST):
+            if len(new) < max(few, FEW if i else 0):
                 break
             p, n, active = dr.gather(mi.Point3f, p, new), dr.gather(mi.Normal3f, n, new), mi.Bool(True)
             slot, entry, level = self._descend(p, n, active)
@@ -246,7 +247,7 @@ class RecordCache:
         k = min(NEIGHBOURS + own, len(self))
         if k <= own or len(points) == 0:
             return near
-        index, distance, cosine = _nearest(self.points, points, k, self.radius)
+        index, distance, cosine = nearest_points(self.points, points, k, self.radius)
         neighbour = (cosine > NEAR_COSINE) & (~own | (index != np.arange(len(points))[:, None]))
         return np.minimum(near, np.where(neighbour, distance + self.radii[index], np.inf).min(1))
 
@@ -255,7 +256,7 @@ class RecordCache:
         old, new = self.points[:first], self.points[first:]
         if len(old) == 0 or len(new) == 0:
             return np.full(len(new), -1)
-        index, distance, cosine = (x[:, 0] for x in _nearest(old, new, 1, self.radius))
+        index, distance, cosine = (x[:, 0] for x in nearest_points(old, new, 1, self.radius))
         same = (cosine > SAME) & (np.signbit(new[:, 5]) == np.signbit(old[index, 5]))   # tangents leap where n.z changes sign
         return np.where(same & (distance <= self.radius), index, -1)
 
@@ -283,7 +284,7 @@ class RecordCache:
         k = min(NEIGHBOURS, len(self))
         if k == 0 or len(points) == 0:
             return np.zeros(len(points), np.intp), np.full(len(points), np.inf)
-        index, distance, cosine = _nearest(self.points, points, k, self.radius)
+        index, distance, cosine = nearest_points(self.points, points, k, self.radius)
         covers = (cosine >= MIN_COSINE) & (distance <= self.radii[index])
         error = np.where(covers, distance / self.radius + 2 * np.sqrt(np.maximum(1.001 - cosine, 0)), np.inf)
         best = np.argmin(error, axis=1, keepdims=True)
@@ -391,7 +392,7 @@ class RecordCache:
         return table
 
 
-def _nearest(points: np.ndarray, queries: np.ndarray, k: int, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def nearest_points(points: np.ndarray, queries: np.ndarray, k: int, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The k nearest of points [n, 6] to each query: indices, distances, cosines between normals [queries, k].
 
     Nearest by distance / radius and 2 sqrt(1 - n.n') as two sides of a right angle: those behind a thin wall are far.
@@ -407,7 +408,7 @@ def _near(points: np.ndarray, others: np.ndarray, radius: float) -> np.ndarray:
     """Mask of the points with one of the others within `radius`."""
     if len(points) == 0 or len(others) == 0:
         return np.zeros(len(points), bool)
-    return np.isfinite(cKDTree(others[:, :3]).query(points[:, :3], distance_upper_bound=radius)[0])
+    return np.isfinite(cKDTree(others[:, :3]).query(points[:, :3], distance_upper_bound=radius, workers=dr.thread_count())[0])
 
 
 def _independent(points: np.ndarray, candidates: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -432,7 +433,7 @@ def _covered(points: np.ndarray, index: np.ndarray, chosen: np.ndarray, radius: 
     if len(index) == 0 or len(chosen) == 0:
         return np.zeros(len(index), bool)
     k = min(NEIGHBOURS, len(chosen))
-    _, distance, cosine = _nearest(points[chosen], points[index], k, radius.max())
+    _, distance, cosine = nearest_points(points[chosen], points[index], k, radius.max())
     return np.any((distance <= radius[index, None]) & (cosine >= MIN_COSINE), axis=1)
 
 

@@ -20,10 +20,10 @@ from collections.abc import Iterator
 import drjit as dr
 import mitsuba as mi
 
-from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
 from olpm_bench.transport.headroom import require
-from olpm_bench.transport.particles import UNBOUNDED_DEPTH, Particles, places
-from olpm_bench.transport.settings import InputError
+from olpm_bench.transport.particles import Particles, places
+from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError
 
 MOST_PATHS = 2 ** 18        # kept of a pass
 BYTES = 144                 # of a vertex
@@ -35,7 +35,8 @@ def wanted(nee: mi.Float, value: mi.Float, reflected: mi.Float) -> mi.Float:
     One sample of each, weighted by the balance heuristic, has least variance where their densities add up to a multiple of
     the integrand F = f cos L.  With the multiple 1 / I, I the integral of F, that is  p_guide = max(F / I - p_nee, 0):  of F
     the share  max(1 - p_nee I / F, 0).  It is nearly 1 for the one patch of sky that shows between slats, where next-event
-    estimation samples the whole sky, and 0 for a lamp in plain view.
+    estimation samples the whole sky, and 0 for a lamp in plain view.  (The path tracer weighs by the power heuristic, for which
+    there is no such formula.)
 
     Args:
         nee: density of next-event estimation, relative to that with which the direction was sampled.
@@ -90,7 +91,7 @@ class CameraPaths:
         self.normal = dr.empty(mi.Float, 2 * size)      # on the incident side; probability that the BSDF chose, or -1
         self.weight = dr.empty(mi.Float, size)          # f cos / (p q) with the probability q of survival, and cos / (p q)
         self.reflected = dr.empty(mi.Float, size)       # by next-event estimation; radiance returned by the continuation
-        self.emitted = dr.zeros(mi.Float, size)         # what the continuation hit, MIS weight included; unused
+        self.emitted = dr.zeros(mi.Float, size)         # what the continuation hit; how densely next-event estimation finds it
         self.count = dr.zeros(mi.UInt32, self.n_paths)  # vertices kept
 
     def arrays(self) -> Iterator[mi.Float]:
@@ -116,7 +117,7 @@ class CameraPaths:
         share = wanted(1, found, bsdf.reflected)
         active = active & self.kept & (depth < self.rows) & (share > 0) & ~ds.delta
         place = (self.rows + depth) * self.n + self.first + path * self.a_sample
-        n = dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))
+        n = incident_normal(si)
         weight = weight * share * dr.maximum(dr.dot(n, ds.d), 0)
         dr.scatter(self.position, mi.Vector4f(si.p.x, si.p.y, si.p.z, weight), place, active)
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)      # as a ray that leaves the scene: see `arrive`
@@ -132,7 +133,7 @@ class CameraPaths:
         active = active & self.kept & (depth < self.rows)
         path = self.first + path * self.a_sample
         place = depth * self.n + path
-        n = dr.select(bsdf.smooth, dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))), 0)
+        n = dr.select(bsdf.smooth, incident_normal(si), 0)
         learnable = (dr.max(weight) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         cosine = dr.maximum(dr.dot(n, si.to_world(bs.wo)), 0)
         per_pdf = dr.select(learnable, cosine / (bs.pdf * survive), 0)

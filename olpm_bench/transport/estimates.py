@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import cKDTree
 
+from olpm_bench.transport.cache import MIN_COSINE, nearest_points
 from representations.interface import ParticleBatch
 from representations.state import copied
 
@@ -67,6 +67,8 @@ class Estimates:
 
     def normalise_camera(self, batch: ParticleBatch) -> ParticleBatch:
         """The same for estimates from camera paths, which are cut at `MOST` times the mean: their tails are heavy."""
+        cut = dr.select(self.camera_count > 0, MOST * self.camera_weight, dr.inf)         # or one would make all others light
+        batch = dataclasses.replace(batch, weight=dr.minimum(batch.weight, dr.gather(mi.Float, cut, batch.record)))
         self.camera_weight, self.camera_count = _advance(self.camera_weight, self.camera_count, batch)
         return _relative(batch, self.camera_weight, MOST)
 
@@ -87,20 +89,21 @@ class Estimates:
         prior = PRIOR * dr.maximum(self.returned, 1e-30)
         return dr.clip((self.by_bsdf + initial * prior) / (self.by_either + prior), FLOOR, 1 - FLOOR)
 
-    def outgoing(self, points: np.ndarray) -> mi.Float:
+    def outgoing(self, points: np.ndarray, radius: float) -> mi.Float:
         """The radiance that each record returns; -1 where neither it nor its neighbours know.
 
         Who has only seen darkness does not know either: to end paths for that would keep the light from being found.
 
         Args:
-            points: positions of the records (n, 3).
+            points: positions and normals of the records (n, 6); radius: their largest validity radius [scene units].
         """
         visits, returned = self.visits.numpy().astype(float), self.returned.numpy().astype(float)
         few = np.flatnonzero((visits < ENOUGH) & visits.any())              # nobody asks where no camera path has been
         result = np.where(returned > 0, returned, -1.0)
         if len(few) and len(points) >= NEIGHBOURS:
-            near = cKDTree(points).query(points[few], k=NEIGHBOURS, workers=dr.thread_count())[1]
-            n, total = visits[near].sum(1), (visits[near] * returned[near]).sum(1)
+            near, _, cosine = nearest_points(points, points[few], NEIGHBOURS, radius)
+            asked = visits[near] * (cosine >= MIN_COSINE)
+            n, total = asked.sum(1), (asked * returned[near]).sum(1)
             result[few] = np.where((n >= ENOUGH) & (total > 0), total / np.maximum(n, 1), -1)
         return copied(mi.Float, result.astype(np.float32))
 

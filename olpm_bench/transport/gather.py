@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from olpm_bench.transport import headroom
 from olpm_bench.transport.cache import Grid, RecordCache
 from olpm_bench.transport.particles import Particles
 from olpm_bench.transport.settings import InputError
@@ -177,6 +178,8 @@ class _Candidates:
     @dr.syntax
     def take(self, last: mi.UInt32, wanted: mi.UInt32, neighbours: int) -> tuple[mi.UInt32, mi.UInt32]:
         """Hits and records of the particles nearer than `last`, and of the first `wanted` at that very distance."""
+        headroom.require(16 * self.n_records * neighbours, f"{neighbours} particles for each of {self.n_records} records",
+                         "fewer neighbours, or a larger record_radius")
         slots = dr.full(mi.UInt32, 0xFFFFFFFF, self.n_records * neighbours)
         first = dr.arange(mi.UInt32, self.n_records) * dr.opaque(mi.UInt32, neighbours)
         taken, run = mi.UInt32(0), mi.UInt32(0)

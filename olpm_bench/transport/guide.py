@@ -167,7 +167,8 @@ class Guide:
     def _tabulate(self) -> None:
         """Bring the rows for queries up to date."""
         c = self.estimates.fraction(self.fraction) if self.fraction is not None else dr.zeros(mi.Float, self.records)
-        outgoing = self.estimates.outgoing(self.cache.points[:, :3])
+        c = dr.select(self.estimates.by_either > 0, c, 0)
+        outgoing = self.estimates.outgoing(self.cache.points, self.cache.radius)
         reflected = dr.select((self.estimates.visits >= ENOUGH) & self.direct, self.estimates.reflected, 0)
         self.rows = dr.ravel(mi.Vector4f(dr.select(self.count >= MIN_PARTICLES, mi.Float(1), 0), c, outgoing, reflected))
         dr.eval(self.rows)

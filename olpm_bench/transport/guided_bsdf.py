@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from olpm_bench.transport.guide import Guide, GuidedPoint
 
 
+def incident_normal(si: mi.SurfaceInteraction3f) -> mi.Normal3f:
+    """The geometric normal, turned to the side that `si.wi` is on."""
+    return dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))
+
+
 class GuidedBSDF:
     """A BSDF at a surface point, with a BSDF's own verbs; without a guide it is the BSDF itself.
 
@@ -45,8 +50,7 @@ class GuidedBSDF:
         self.guided: GuidedPoint | None = None
         self.outgoing, self.reflected, self.chosen_by_bsdf = mi.Float(-1), mi.Float(0), mi.Float(-1)
         if guide is not None and guide.records:
-            n = dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi)))       # geometric normal, turned to the incident side
-            self.guided = guide.at(si.p, n, self.smooth)
+            self.guided = guide.at(si.p, incident_normal(si), self.smooth)
             learnt = self.guided.fraction
             self.fraction = dr.select(self.guided.valid, dr.select(learnt > 0, learnt, fraction), 1)
             self.outgoing, self.reflected = self.guided.outgoing, self.guided.reflected

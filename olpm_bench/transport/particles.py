@@ -19,9 +19,9 @@ import mitsuba as mi
 import numpy as np
 
 from olpm_bench.transport.guide import Guide
-from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
 from olpm_bench.transport.headroom import require
-from olpm_bench.transport.settings import InputError
+from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError
 from olpm_bench.transport.window import HEAVIEST, HIGH, LEAST_SURVIVAL, LIGHTEST, LOW, Window
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 MOST_COPIES = 32                # of a particle that splits
 LEVELS = 3                      # particles in waiting, each with its copies, before there is no more splitting
 LANES = 1 << 13                 # particles traced side by side; a lane takes up the next when one has ended
-UNBOUNDED_DEPTH = 32            # particle paths end here when camera paths have no limit
 DEPARTURES = 8                  # kept of an importon's path on average: its first ones; only proposals are learnt from them
 
 
@@ -63,7 +62,7 @@ class Particles:
     """
     position: mi.Float      # [rows * lanes * 4] position and weight
     direction: mi.Float     # [rows * lanes * 4] direction the particle came from, and length of its last segment
-    normal: mi.Float        # [rows * lanes * 4] geometric normal on the incident side, unused
+    normal: mi.Float        # [rows * lanes * 4] geometric normal on the incident side; of camera paths, who chose the direction
     place: mi.UInt32        # [hits]
     lanes: int
     departures: Departures | None = None
@@ -216,7 +215,7 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         first_met = hit & ~met_before
         keep = first_met & bsdf.smooth & (depth >= 2)
         place = count * n_lanes + lane
-        n_incident = dr.mulsign(si.n, -dr.dot(si.n, ray.d))
+        n_incident = incident_normal(si)
         dr.scatter(position, mi.Vector4f(si.p.x, si.p.y, si.p.z, mi.luminance(weight)), place, keep)
         dr.scatter(direction, mi.Vector4f(-ray.d.x, -ray.d.y, -ray.d.z, si.t), place, keep)
         dr.scatter(normal, mi.Vector4f(n_incident.x, n_incident.y, n_incident.z, 0), place, keep)

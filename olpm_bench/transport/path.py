@@ -52,13 +52,18 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
                      log: CameraPaths | None = None) -> mi.TensorXf:
         """An image, and if asked for the vertices of its paths.
 
+        Its samples are independent, whatever the scene's sampler: others round their number, and a lane takes several.
+
         Args:
+            spp: samples a pixel; 0: as many as the scene asks for.
             log: keeps the vertices; of as many paths as the image has samples.
         """
-        film = sensor.film()
+        film, spp = sensor.film(), spp or sensor.sampler().sample_count()
         with dr.suspend_grad():
             camera = CameraRays(sensor, spp, self.paths_a_lane(sensor, spp))
-            sampler, _ = self.prepare(sensor, dr.opaque(mi.UInt32, seed), camera.lanes_a_pixel)
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.seed(dr.opaque(mi.UInt32, seed), dr.width(camera.corner))
+            film.prepare([])
             ray, weight, position = camera.next(sampler)
             L, valid, _ = self.walk(scene, sampler, ray, True, weight, camera, log)
             block = film.create_block()
@@ -96,7 +101,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         estimate = guide.pixels if guide is not None and self.settings.roulette == "contribution" else None
         pixel = estimate.at(camera.uv) if estimate is not None and camera is not None else None
         paths = camera.paths_a_lane if camera is not None else 1
-        end_paths, by_contribution = self.settings.roulette != "none", pixel is not None
+        end_paths, know_worth = self.settings.roulette != "none", pixel is not None
         worth = window * pixel if pixel is not None else mi.Float(0)        # what a path is worth to its pixel
         ctx = mi.BSDFContext()
 
@@ -147,9 +152,9 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             survive = mi.Float(1)                       # probability of going on
             if dr.hint(end_paths, mode="scalar"):
                 survive = roulette.by_throughput(beta * weight, eta * bs.eta, depth + 1 >= rr_depth)
-            if dr.hint(by_contribution, mode="scalar"):
+            if dr.hint(know_worth, mode="scalar"):
                 known = (bsdf.outgoing >= 0) & (depth > 0)
-                survive = dr.select(known, roulette.by_contribution(beta, bsdf.outgoing, worth), survive)
+                survive = dr.select(known, roulette.by_contribution(beta, bsdf.outgoing, worth, depth), survive)
             active_next &= dr.max(weight) > 0
             survives = (survive == 1) | (sampler.next_1d(active_next & (survive < 1)) < survive)
             active_next &= survives

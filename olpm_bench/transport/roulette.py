@@ -12,9 +12,11 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter, median_filter
 
+from olpm_bench.transport.settings import UNBOUNDED_DEPTH
 from representations.state import copied
 
 LEAST = 0.05            # survival probability
+MOST = 0.95             # of paths by their throughput, and of those of more than `UNBOUNDED_DEPTH` segments
 DARKEST = 0.02          # of a pixel, relative to the image's mean: black ones would keep every path
 SIGMA = 1.0             # of the filter [pixels]
 
@@ -42,9 +44,12 @@ class PixelEstimate:
 
 def by_throughput(beta: mi.Spectrum, eta: mi.Float, deep: mi.Bool) -> mi.Float:
     """Survival probability after scattering, as in Mitsuba's `path`: `eta` cancels the square that refraction multiplies with."""
-    return dr.select(deep, dr.minimum(dr.max(beta) * dr.square(eta), 0.95), 1)
+    return dr.select(deep, dr.minimum(dr.max(beta) * dr.square(eta), MOST), 1)
 
 
-def by_contribution(beta: mi.Spectrum, outgoing: mi.Float, worth: mi.Float) -> mi.Float:
-    """Survival probability before scattering: expected contribution over what is `worth` a path; see above."""
-    return dr.clip(mi.luminance(beta) * outgoing / worth, LEAST, 1)
+def by_contribution(beta: mi.Spectrum, outgoing: mi.Float, worth: mi.Float, depth: mi.UInt32) -> mi.Float:
+    """Survival probability before scattering: expected contribution over what is `worth` a path; see above.
+
+    Paths without limit must end somewhere, though between white walls they may stay worth their while.
+    """
+    return dr.clip(mi.luminance(beta) * outgoing / worth, LEAST, dr.select(depth < UNBOUNDED_DEPTH, 1, MOST))

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, TypeVar
 
 from representations import wrong_type
 
+UNBOUNDED_DEPTH = 32                # where camera paths have no limit, particle paths end, and roulette ends camera paths
 MOST = 2 ** 31 - 1                  # of whole numbers, which become 32-bit ones
 STRICT = {"extra": "forbid"}        # read by pydantic: unknown keys are errors
 
@@ -80,7 +81,7 @@ class TrainingSettings:
     while_rendering: go on learning from the paths of every rendering pass.
     gather: "binned": the particles whose look-up gives the record, at most `neighbours` of them;
         "nearest": exactly the `neighbours` nearest within the record radius, as in the paper.  (Camera paths are binned.)
-    neighbours: particles of a pass used by a record [L: 250].
+    neighbours: particles of a pass used by a record, at most [L: 250].
     record_radius: largest validity radius of a record, in units of the scene's diagonal [L: 0.01].
     shrink: records shrink from there, to a tenth at most, where particles are dense, sources near or lobes sharp, as in the
         paper; off by default: at equal time it costs more than it gains.
@@ -107,7 +108,7 @@ class TrainingSettings:
     blend: bool = True
     while_rendering: bool = False
     gather: Literal["binned", "nearest"] = "binned"
-    neighbours: int = 250
+    neighbours: int = 1000
     record_radius: float = 0.02
     shrink: bool = False
     inherit: bool = True
@@ -143,8 +144,9 @@ def _require_choice(settings: Any, name: str, *choices: str) -> None:
 
 # Photons and importons only, a fixed fraction; gather and particles of a pass are those of the paper's library [L], the talk
 # has 30 passes of 100,000 photons and as many importons [T].
-_PAPER = {"gather": "nearest", "record_radius": 0.01, "shrink": True, "passes": 10, "photons": 300_000, "importons": 300_000,
-          "camera_passes": 0, "learn_fraction": False, "weight_window": "flux", "fraction": 0.5, "parallax": False}
+_PAPER = {"gather": "nearest", "neighbours": 250, "record_radius": 0.01, "shrink": True, "passes": 10, "photons": 300_000,
+          "importons": 300_000, "camera_passes": 0, "learn_fraction": False, "weight_window": "flux", "fraction": 0.5,
+          "parallax": False}
 
 # What each preset changes of the defaults, which are those of `best`: it names its roulette, too, so that a method's own preset
 # brings it where `[integrator]` names another for all.

@@ -160,16 +160,16 @@ class Training:
         self.camera_spp = 1 << max(0, round(np.log2(settings.camera_paths / self.pixels)))      # of a camera pass
         self.sampler = mi.load_dict({"type": "independent"})
         self.draws = 0                      # seeds used so far
-        particle_passes = {"interleaved": [self._interleaved] * settings.passes,
-                           "importons_first": [self._importons] * settings.passes + [self._photons] * settings.passes,
-                           "single_batch": [self._single_batch] * min(settings.passes, 1)}[settings.schedule]
-        self.steps = particle_passes + [self._camera_pass] * settings.camera_passes
+        particles = {"interleaved": [self._interleaved], "importons_first": [self._importons, self._photons],
+                     "single_batch": [self._single_batch]}[settings.schedule]
+        times = min(settings.passes, 1) if settings.schedule == "single_batch" else settings.passes
+        self.steps = [(step, times) for step in particles] + [(self._camera_pass, settings.camera_passes)]
         # Of photons and importons: hits a particle leaves in their first pass, and what the window is told for as many.
         self.hits: dict[mi.TransportMode, tuple[float, float]] = {}
 
     def run(self) -> Iterator[PassStatistics]:
         """Train as the settings say, one pass at each step.  Who stops early has a guide as good as the passes done."""
-        for index, step in enumerate(self.steps):
+        for index, step in enumerate(step for step, times in self.steps for _ in range(times)):
             yield step(PassStatistics(index, self.passes, warnings=self._out_of_scale() if index == 0 else []))
 
     def _out_of_scale(self) -> list[str]:
@@ -182,7 +182,7 @@ class Training:
     @property
     def passes(self) -> int:
         """Of particles and of camera paths together."""
-        return len(self.steps)
+        return sum(times for _, times in self.steps)
 
     def camera_pass(self) -> PassStatistics:
         """One more pass of camera paths, after or beside those of `run`."""

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from olpm_bench.transport.guide import Guide
+from olpm_bench.transport.guided_bsdf import incident_normal
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,7 @@ def records_seen(scene: mi.Scene, guide: Guide, sensor: mi.Sensor | None = None)
     at = mi.Point2f((mi.Float(x) + 0.5) / width, (mi.Float(y) + 0.5) / height)
     ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
-    n = dr.mulsign(si.n, -dr.dot(si.n, ray.d))
-    record, _, valid = guide.cache.lookup(si.p, n, si.is_valid())
+    record, _, valid = guide.cache.lookup(si.p, incident_normal(si), si.is_valid())
     found = np.broadcast_to(valid.numpy(), width * height)
     index = np.where(found, np.broadcast_to(record.numpy(), width * height).astype(int), -1)
     radius, count = np.append(guide.cache.radii / guide.cache.radius, np.nan), np.append(guide.count.numpy(), 0)

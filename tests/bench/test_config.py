@@ -224,11 +224,17 @@ def test_the_key_follows_our_own_code_and_the_reference_does_not(tmp_path, monke
     assert before.reference_key(before.scene[0]) == after.reference_key(after.scene[0])
 
 
-@pytest.mark.parametrize("name", ["cell.py", "path.py", "jensen.py"])
-def test_our_own_code_is_that_of_cells_transport_and_representations(monkeypatch, name):
+@pytest.mark.parametrize("name", ["cell.py", "clock.py", "accumulator.py", "materials.py", "path.py", "jensen.py"])
+def test_our_own_code_is_that_of_cells_scenes_transport_and_representations(monkeypatch, name):
     before, read = config.own_code(), Path.read_text
     monkeypatch.setattr(Path, "read_text", lambda file, **k: read(file, **k) + "#" * (file.name == name))
     assert config.own_code.__wrapped__() != before
+
+
+def test_cells_of_another_variant_are_others(tmp_path, monkeypatch):
+    keys = [c.key for c in load(tmp_path, MINIMAL).cells()]
+    monkeypatch.setenv("OLPM_BENCH_VARIANT", "cuda_ad_rgb")
+    assert not set(keys) & {c.key for c in load(tmp_path, MINIMAL).cells()}
 
 
 def test_a_missing_file_and_one_that_is_no_text(tmp_path):
@@ -269,7 +275,7 @@ def test_the_resolved_file_describes_the_same_cells(tmp_path):
     assert [c.key for c in again.cells()] == [c.key for c in experiment.cells()]
     assert again.scene[0].crops == [[1, 2, 8, 4]] and again.of_results(folder).path == Path("test.toml")
     resolved = tomllib.loads(experiment.toml())
-    assert resolved["schema_version"] == 1 and resolved["method"][1]["training"]["neighbours"] == 250
+    assert resolved["schema_version"] == 1 and resolved["method"][1]["training"]["neighbours"] == 1000
     assert resolved["scene"][0]["parameters"]["light_size"] == 0.5
 
 
@@ -285,7 +291,7 @@ def test_the_key_changes_with_all_that_determines_the_cell(tmp_path, old, new):
 
 @pytest.mark.parametrize("old, new", [
     ('title = "Test"', 'title = "Another"'), ("seeds = 2", "seeds = [0, 7]"), ('"Cosine"', '"Lambert"'),
-    ("width = 16", "width = 16\nparameters = { light_size = 0.5 }"), ("passes = 2", "passes = 2\nneighbours = 250"),
+    ("width = 16", "width = 16\nparameters = { light_size = 0.5 }"), ("passes = 2", "passes = 2\nneighbours = 1000"),
     ("width = 16", "width = 16\ncrops = [[1, 2, 8, 4], [3, 4, 4, 2]]"),
 ])
 def test_the_key_ignores_labels_and_written_out_defaults(tmp_path, old, new):

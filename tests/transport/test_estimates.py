@@ -69,8 +69,31 @@ def test_records_with_few_visits_ask_their_neighbours():
     found = Estimates.nothing(20)
     found.visits = mi.Float(np.r_[np.full(10, 100), np.zeros(10)].astype(np.float32))
     found.returned = mi.Float(np.r_[np.full(10, 2.5), np.zeros(10)].astype(np.float32))
-    points = np.zeros((20, 3), np.float32)
-    points[:, 0] = np.r_[np.arange(10), np.arange(9.5, 10.5, 0.1)]
-    np.testing.assert_allclose(found.outgoing(points).numpy()[:10], 2.5)
-    assert set(np.round(found.outgoing(points).numpy()[10:], 3)) <= {2.5, -1.0}
-    assert found.outgoing(points).numpy()[10] == 2.5 and found.outgoing(points).numpy()[19] == -1
+    points = np.zeros((20, 6), np.float32)
+    points[:, 0], points[:, 5] = np.r_[np.arange(10), np.arange(9.5, 10.5, 0.1)], 1
+    outgoing = found.outgoing(points, 5.0).numpy()
+    np.testing.assert_allclose(outgoing[:10], 2.5)
+    assert set(np.round(outgoing[10:], 3)) <= {2.5, -1.0}
+    assert outgoing[10] == 2.5 and outgoing[19] == -1
+
+
+def test_nobody_asks_behind_a_wall():
+    """A lit and a dark side, of eight records each, and one more on either that has had few visits."""
+    found = Estimates.nothing(18)
+    found.visits = mi.Float(np.r_[np.full(16, 100), 2, 2].astype(np.float32))
+    found.returned = mi.Float(np.r_[np.full(8, 2.5), np.full(8, 0.1), 0, 0].astype(np.float32))
+    points = np.zeros((18, 6), np.float32)
+    points[:, 0], points[:, 5] = np.r_[np.arange(8), np.arange(8), 3.5, 3.5], np.r_[np.ones(8), -np.ones(8), 1, -1]
+    np.testing.assert_allclose(found.outgoing(points, 5.0).numpy()[16:], [2.5 * 800 / 802, 0.1 * 800 / 802], rtol=0.03)
+
+
+def test_one_heavy_estimate_does_not_make_the_others_light():
+    def batch(*weights: float) -> ParticleBatch:
+        wo = mi.Vector3f(0, 0, 1) + mi.Vector3f(np.zeros((3, len(weights)), np.float32))
+        return ParticleBatch.from_arrays(wo, mi.Float(list(weights)), mi.UInt32([0] * len(weights)), 2)
+
+    found = Estimates.nothing(2)
+    found.normalise_camera(batch(*[1.0] * 999))
+    heavy = found.normalise_camera(batch(1e6, 1.0))
+    assert found.camera_weight[0] == pytest.approx((1000 + estimates.MOST) / 1001, rel=1e-4)
+    np.testing.assert_allclose(heavy.weight.numpy(), np.array([estimates.MOST, 1]) / found.camera_weight[0], rtol=0.02)

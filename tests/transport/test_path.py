@@ -70,6 +70,17 @@ def test_every_emitter_trains_and_agrees(name, mitsuba_path):
     assert_same_expectation(passes(scene, olpm_bench.integrator(guide, max_depth=DEPTH)), passes(scene, mitsuba_path, seed=1000))
 
 
+@pytest.mark.parametrize("sampler", ["independent", "stratified"])
+def test_samples_a_pixel_are_those_of_the_scene_if_not_given(sampler):
+    scene = mi.load_dict(box(grey(0.7), lamp=lamp()))
+    film = {"type": "hdrfilm", "width": 6, "height": 5, "rfilter": {"type": "box"}}
+    sensor = mi.load_dict({"type": "perspective", "film": film, "sampler": {"type": sampler, "sample_count": 16}})
+    integrator = olpm_bench.integrator(max_depth=3)
+    given, asked, odd = (mi.render(scene, sensor=sensor, integrator=integrator, spp=spp).numpy() for spp in (16, 0, 7))
+    np.testing.assert_array_equal(given, asked)
+    assert given.shape == odd.shape == (5, 6, 3)
+
+
 def test_max_depth(mitsuba_path):
     """Depth counts as in Mitsuba: 1 shows emitters, 2 adds direct light."""
     scene = mi.load_dict(box(grey(0.7), lamp=lamp()))

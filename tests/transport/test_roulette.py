@@ -29,8 +29,8 @@ def test_outliers_and_black_pixels():
 
 def test_survival():
     beta = mi.Spectrum(0.1)
-    contribution = roulette.by_contribution(beta, mi.Float(0, 0.5, 2, 1e6), mi.Float(1))
-    np.testing.assert_allclose(contribution.numpy(), [roulette.LEAST, 0.05, 0.2, 1])
+    contribution = roulette.by_contribution(beta, mi.Float(0, 0.5, 2, 1e6, 1e6), mi.Float(1), mi.UInt32(1, 1, 1, 31, 32))
+    np.testing.assert_allclose(contribution.numpy(), [roulette.LEAST, 0.05, 0.2, 1, roulette.MOST])     # none is endless
     throughput = roulette.by_throughput(beta, mi.Float(1, 2, 100), mi.Bool(True))
     np.testing.assert_allclose(throughput.numpy(), [0.1, 0.4, 0.95], rtol=1e-5)
     assert roulette.by_throughput(beta, mi.Float(1), mi.Bool(False)).numpy() == 1

@@ -46,6 +46,8 @@ def test_guides_learn_on_line(scene, name):
     assert guide.records == seen[-1].records > 100
     enough, fraction, outgoing, _ = guide.rows.numpy().reshape(-1, 4).T
     assert set(enough) <= {0, 1} and enough.mean() == pytest.approx(guide.trained) and (outgoing != 0).all()
+    assert guide.estimates.by_either.numpy()[fraction == 0].max(initial=0) == 0          # nothing learnt: as the settings say
+    fraction = fraction[fraction > 0]
     assert fraction.min() >= FLOOR - 1e-6 and fraction.max() <= 1 - FLOOR + 1e-6 and (fraction.std() > 0.01 or name == "cosine")
     assert np.mean(guide.count.numpy() >= 40) > 0.8
 
