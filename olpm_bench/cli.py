@@ -39,11 +39,14 @@ Assignments = Annotated[list[str], typer.Option(
 
 
 def complain(message: str) -> None:
-    """One line on stderr; what came from a file can neither steer the terminal nor fill it."""
-    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(message.split()))
-    if len(line) > LONGEST:
-        line = f"{line[:LONGEST // 2]} ... {line[-LONGEST // 2:]}"
-    print(f"olpm-bench: {line}", file=sys.stderr)
+    """One line on stderr."""
+    print(f"olpm-bench: {one_line(' '.join(message.split()))}", file=sys.stderr)
+
+
+def one_line(text: str) -> str:
+    """What came from a file can neither steer the terminal nor fill it."""
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return line if len(line) <= LONGEST else f"{line[:LONGEST // 2]} ... {line[-LONGEST // 2:]}"
 
 
 def command(body: Callable[..., None]) -> Callable[..., None]:
@@ -108,6 +111,17 @@ def _load(path: Path, replacements: list[str] | None = None, scale: str | None =
 
         environment.select_variant()            # other people's file may name Mitsuba's types when it is imported
     return experiment_file.load(path, scenes, scale)
+
+
+def _load_run(source: Path, results: Path, replacements: list[str] | None, scale: str | None) -> tuple[Any, Path]:
+    """An experiment and the folder of its results, of which either is named: the TOML, or the folder, which has a copy of it."""
+    if not source.is_dir():
+        loaded = _load(source, replacements, scale)
+        return loaded, results / loaded.stem
+    if not (source / "experiment.toml").is_file():
+        raise InputError(f"{source} is no folder of results: it has no experiment.toml")
+    folder = source.resolve()
+    return _load(folder / "experiment.toml", replacements, scale).of_results(folder), folder
 
 
 @command
@@ -196,16 +210,11 @@ def report(source: Annotated[Path, typer.Argument(metavar="RESULTS|EXPERIMENT.to
     """Print the table and draw the figures and the page of a complete experiment again."""
     from olpm_bench.bench import environment
 
-    folder = source / "experiment.toml"
-    if source.is_dir() and not folder.is_file():
-        raise InputError(f"{source} is no folder of results: it has no experiment.toml")
-    loaded = _load(folder if source.is_dir() else source, scene, scale)
-    if source.is_dir():
-        loaded, results = loaded.of_results(source.resolve()), source.resolve().parent
+    loaded, folder = _load_run(source, results, scene, scale)
     environment.select_variant()
     from olpm_bench.bench import run as runner
 
-    runner.report(loaded, results)
+    runner.report(loaded, folder.parent)
 
 
 @command
@@ -250,24 +259,21 @@ def reference(experiment: ExperimentFile, results: ResultsFolder = Path("results
 
 
 @command
-def metrics(experiment: Annotated[Path, typer.Argument(metavar="RESULTS|EXPERIMENT.toml", show_default=False,
-                                                       help="A folder of results, or the TOML that they are of.")],
+def metrics(source: Annotated[Path, typer.Argument(metavar="RESULTS|EXPERIMENT.toml", show_default=False,
+                                                   help="A folder of results, or the experiment that they are of.")],
             results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
             scale: Scale = None) -> None:
     """Compute every metric anew from the images of an experiment; nothing is rendered."""
-    is_folder = experiment.is_dir()
-    loaded = _load(experiment / "experiment.toml" if is_folder else experiment, scene, scale)
-    loaded = loaded.of_results(experiment.resolve()) if is_folder else loaded
-    folder = experiment if is_folder else results / loaded.stem
     from olpm_bench.bench import environment
 
+    loaded, folder = _load_run(source, results, scene, scale)
     environment.select_variant()
     from olpm_bench.bench import finished, summary
     from olpm_bench.bench import run as runner
     from olpm_bench.bench.results import Results
 
     stored = Results(folder)
-    references = runner.references(loaded, folder.resolve().parent)
+    references = runner.references(loaded, folder.parent)
     found = summary.summarise(finished.read(loaded, stored, references, any_version=True))
     summary.write(found, stored)
     summary.print_metrics(found)
@@ -331,11 +337,11 @@ def inspect(run: Annotated[Path, typer.Argument(metavar="RUN", help="An experime
                                                      show_default=False)],
             scene: Annotated[str | None, typer.Option(metavar="NAME[=PATH]", help="Which scene, and where its file is.",
                                                       show_default=False)] = None,
-            seed: Annotated[int | None, typer.Option(min=0, help="Of the training; the experiment's first by default.",
-                                                     show_default=False)] = None,
+            seed: Annotated[int | None, typer.Option(min=0, max=2**15 - 1, show_default=False,
+                                                     help="Of the training; the experiment's first by default.")] = None,
             vertex: Annotated[int | None, typer.Option(min=1, help="Of a path from that pixel; the first that is not specular by "
                                                        "default.", show_default=False)] = None,
-            path_seed: Annotated[int, typer.Option(min=0, help="Of that path.")] = 0,
+            path_seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of that path.")] = 0,
             guide: Annotated[list[str], typer.Option(metavar="METHOD=FILE.npz", help="Use this guide; train none.")] = [],  # noqa: B006
             passes: Annotated[int, typer.Option(min=2, help="Of the truth, 64 paths a bin each.")] = 16,
             results: ResultsFolder = Path("results"), scale: Scale = None) -> None:
@@ -344,13 +350,11 @@ def inspect(run: Annotated[Path, typer.Argument(metavar="RUN", help="An experime
 
     name, _, file = (scene or "").partition("=")
     pixels, guides = [_pixel(text) for text in pixel], dict(_named_file(text, "--guide") for text in guide)
-    if run.is_dir() and not (run / "experiment.toml").is_file():
-        raise InputError(f"{run}: no experiment.toml in it, so it is not the results folder of an experiment")
-    loaded = _load(run / "experiment.toml" if run.is_dir() else run, [f"{name}={file}"] if file else [], scale)
+    loaded, folder = _load_run(run, results, [f"{name}={file}"] if file else [], scale)
     environment.select_variant()
     from olpm_bench.bench import inspect as inspector
 
-    written = inspector.inspect(loaded, run if run.is_dir() else results / loaded.stem, pixels, scene=name or None, seed=seed,
+    written = inspector.inspect(loaded, folder, pixels, scene=name or None, seed=seed,
                                 number=vertex, path_seed=path_seed, passes=passes, guides=guides)
     for path in written:
         print(path)
@@ -453,9 +457,9 @@ def list_() -> None:
     for file in files:
         try:
             title = tomllib.loads(file.read_text(encoding="utf-8")).get("title", "")
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             title = f"cannot be read: {error}"
-        print(f"  {file}: {title}")
+        print(one_line(f"  {file}: {title}"))
     if not files:
         print("  none in ./experiments")
 

@@ -266,6 +266,9 @@ class _Cell:
             self.targets = checkpoint_times(spent, limit, budget.checkpoints)
         if spent >= limit or spent >= self.targets[0]:
             self.targets = [t for t in self.targets if t > spent]
+            if budget.spp is not None and self.trace and self.trace[-1]["spp"] == self.image.spp:
+                self.trace.pop()            # since then there was training only
+                self.checkpoints.pop()
             self.trace.append({
                 "seconds": total.charged, "train_seconds": self.clock["train"].charged,
                 "render_seconds": self.clock["render"].charged, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
@@ -312,10 +315,10 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
         "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
         "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
         "trained": guide.trained if guide is not None else None, "training_ended": ended,
-        "training_passes": len(cell.training),
+        "training_passes": sum(p["index"] < p["passes"] for p in cell.training),       # not those while rendering
         "warnings": list(dict.fromkeys(w for p in cell.training for w in p["warnings"])),
         "records": guide.records if guide is not None else 0, "particles": guide.particles if guide is not None else 0,
-        "bytes_per_record": guide.bytes_per_record if guide is not None else 0, "invalid_pixels": 0,
+        "bytes_per_record": guide.bytes_per_record if guide is not None else 0,
         "mean": float(cell.brightness.mean[0, 0, 0]), "mean_stderr": math.sqrt(float(cell.brightness.variance()[0, 0, 0])),
         "pass_spp": spp, "passes": cell.training,
     }

@@ -24,6 +24,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 import representations
 from olpm_bench import scenes as embedded
 from olpm_bench import transport
+from olpm_bench.bench import environment
 from olpm_bench.bench.files import SCHEMA_VERSION, slug
 from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes
@@ -242,7 +243,8 @@ class CellSpec:
         """Hash of everything that determines the cell, our code included: change any of it and the cell is redone."""
         config = {k: v for k, v in self.config().items() if k not in ("scene", "file", "method")}      # labels
         return _hash({**config, "scene": self.scene.digest(), "code": _representation_code(self.method),
-                      "own_code": own_code(), "mitsuba": importlib.metadata.version("mitsuba"), "schema_version": SCHEMA_VERSION})
+                      "own_code": own_code(), "mitsuba": importlib.metadata.version("mitsuba"),
+                      "variant": environment.wanted_variant(), "schema_version": SCHEMA_VERSION})
 
     def __str__(self) -> str:
         return f"{self.scene.name} / {self.method.name} / seed {self.seed}"
@@ -481,9 +483,9 @@ def _hash(value: Any) -> str:
 
 @functools.cache
 def own_code() -> str:
-    """Hash of the sources of cells, path tracing, training and representations, so that figures never mix versions."""
-    files = [Path(__file__).with_name("cell.py")]
-    for package in (transport, representations):
+    """Hash of the sources of cells, scenes, path tracing, training and representations, so that figures never mix versions."""
+    files = [Path(__file__).with_name(name) for name in ("cell.py", "clock.py", "accumulator.py")]
+    for package in (embedded, transport, representations):
         files += sorted(Path(package.__path__[0]).glob("*.py"))
     return _hash([[file.name, file.read_text(encoding="utf-8")] for file in files])
 

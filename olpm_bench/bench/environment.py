@@ -24,10 +24,7 @@ def select_variant(threads: int | None = None) -> str:
         InputError: a variant in which the guided path tracer does not work; a thread count below 1.
         LLVMError: no usable libLLVM.
     """
-    variant = os.environ.get(VARIANT_VARIABLE, VARIANTS[0])
-    if variant not in VARIANTS:
-        raise InputError(f"{VARIANT_VARIABLE}={variant}: the guided path tracer works on unpolarised RGB, vectorised; "
-                         f"must be one of {', '.join(VARIANTS)}")
+    variant = wanted_variant()
     if threads is not None and threads < 1:
         raise InputError(f"--threads {threads}: must be >= 1")
     if variant.startswith("llvm"):
@@ -40,6 +37,19 @@ def select_variant(threads: int | None = None) -> str:
     mi.set_log_level(mi.LogLevel.Warn)
     if threads is not None:
         dr.set_thread_count(threads)
+    return variant
+
+
+def wanted_variant() -> str:
+    """What `OLPM_BENCH_VARIANT` names, llvm_ad_rgb by default.
+
+    Raises:
+        InputError: a variant in which the guided path tracer does not work.
+    """
+    variant = os.environ.get(VARIANT_VARIABLE, VARIANTS[0])
+    if variant not in VARIANTS:
+        raise InputError(f"{VARIANT_VARIABLE}={variant}: the guided path tracer works on unpolarised RGB, vectorised; "
+                         f"must be one of {', '.join(VARIANTS)}")
     return variant
 
 
@@ -108,8 +118,9 @@ def describe() -> dict[str, Any]:
 def machine() -> dict[str, Any]:
     """What goes into cell.json, where several machines make an experiment.  Needs a variant."""
     import drjit as dr
+    import mitsuba as mi
 
-    return {"host": socket.gethostname(), "cpu": _cpu(), "cores": cores(), "threads": dr.thread_count()}
+    return {"host": socket.gethostname(), "cpu": _cpu(), "cores": cores(), "threads": dr.thread_count(), "variant": mi.variant()}
 
 
 def _cpu() -> str:

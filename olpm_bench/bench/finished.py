@@ -59,9 +59,13 @@ class FinishedScene:
         return {name: np.array([metric(image, truth) for image in images]) for name, metric in metrics.METRICS.items()}
 
     def curves(self, over: str = "seconds") -> dict[str, statistics.Curve]:
-        """Method -> its L1 error over a column of the traces: charged seconds, or "spp".  There must be a reference."""
+        """Method -> its L1 error over a column of the traces: charged seconds, or "spp".  There must be a reference.
+
+        Without methods that have no error at all, as of a black scene: logarithmic axes have no place for them.
+        """
         return {method: statistics.common_curve([np.array([line[over] for line in cell.trace], np.float64) for cell in cells],
-                                                self._l1[method]) for method, cells in self.cells.items()}
+                                                self._l1[method])
+                for method, cells in self.cells.items() if all((errors > 0).all() for errors in self._l1[method])}
 
     @cached_property
     def _l1(self) -> dict[str, list[np.ndarray]]:
@@ -74,9 +78,11 @@ class FinishedScene:
     @cached_property
     def speed_ups(self) -> dict[str, statistics.Interval]:
         """Method -> its speed-up over the baseline at equal L1, a ratio of charged seconds; empty without reference."""
-        curves = self.curves() if self.reference is not None else {}
-        return {method: statistics.speed_up(curves[self.baseline], curve) for method, curve in curves.items()
-                if method != self.baseline}
+        if self.reference is None:
+            return {}
+        curves, unknown = self.curves(), statistics.Interval(np.nan, np.nan, np.nan)
+        return {method: statistics.speed_up(curves[self.baseline], curves[method]) if {self.baseline, method} <= curves.keys()
+                else unknown for method in self.cells if method != self.baseline}
 
 
 @dataclass(frozen=True)
@@ -100,10 +106,12 @@ class Finished:
 
     @cached_property
     def machines(self) -> list[str]:
-        """The machines that the cells were made on, "CPU, n threads"; where no cell says so, that of the last run."""
+        """The machines that the cells were made on, "CPU, n threads" (and the variant, if that is none for a CPU); where no cell
+        says so, that of the last run."""
         cells = [cell for scene in self.scenes for group in scene.cells.values() for cell in group]
         said = [cell.info["machine"] for cell in cells if "machine" in cell.info] or [read_json(self.results.folder / "env.json")]
-        return sorted({f"{m['cpu']}, {m['threads']} threads" if "threads" in m else m["cpu"] for m in said})
+        return sorted({", ".join([m["cpu"], *([f"{m['threads']} threads"] if "threads" in m else []),
+                                  *([m["variant"]] if not m.get("variant", "llvm").startswith("llvm") else [])]) for m in said})
 
 
 def read(experiment: Experiment, results: Results, references: Mapping[str, Reference], any_version: bool = False) -> Finished:

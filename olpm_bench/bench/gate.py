@@ -86,7 +86,7 @@ def _ratio(claim: Claim, better: list[Cell], worse: list[Cell], reference: Refer
         def of_variances(index: np.ndarray) -> float:
             a, b = (variance(w.luminance[index], w.seconds[index]) for w in works)
             return a / b if b > 0 else float("nan")
-        return statistics.jackknife(of_variances, n, least=2, confidence=claim.confidence)
+        return statistics.jackknife(of_variances, n, confidence=claim.confidence)
     assert reference is not None
     metric = metrics.METRICS[claim.metric]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,6 +1,7 @@
 """`olpm-bench inspect`: the guides of an experiment at what one pixel sees, beside the truth.
 
-Guides are not stored with cells: each is trained here as its cell trains it, which for budgets in samples is the very same guide.
+Guides are not stored with cells: each is trained here as its cell trains it, which for budgets in samples is the very same guide
+that its rendering began with.
 For budgets in seconds the clock of a cell decided how many passes it got: as many as the stored cell had, if there is one, else
 as many as fit into the budget's share here.
 """
@@ -24,6 +25,7 @@ from olpm_bench.bench.config import CellSpec, ConfigError, Experiment
 from olpm_bench.bench.files import SCHEMA_VERSION, require_inside, slug, write_json
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.results import Results
+from olpm_bench.bench.run import require_memory
 from olpm_bench.report import figures, landings, records
 from olpm_bench.report import inspect as picture
 from olpm_bench.transport.camera_paths import CameraPaths
@@ -75,6 +77,7 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
         if method not in [spec.method.name for spec in guided]:
             raise ConfigError(f"--guide {method}={files[method]}: no method {method!r} with a guide; "
                               f"known: {', '.join(spec.method.name for spec in guided)}")
+    require_memory([spec for spec in guided if spec.method.name not in files])
     loaded = cells.load_scene(specs[0])
     vertices = {pixel: _vertex(loaded, pixel, specs[0].integrator.max_depth, number, path_seed) for pixel in pixels}
     learnt: dict[str, Learnt] = {}

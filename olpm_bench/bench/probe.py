@@ -19,7 +19,7 @@ from typing import Any
 
 from olpm_bench.scenes import SceneError, read_xml
 
-COMMAND = (sys.executable, "-m", "olpm_bench.bench.probe")
+COMMAND = (sys.executable, "-P", "-m", "olpm_bench.bench.probe")     # -P: imports nothing from the folder that one works in
 SECONDS = 900.0             # that a scene may take
 
 

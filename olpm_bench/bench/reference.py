@@ -22,6 +22,7 @@ from olpm_bench.bench.lock import locked
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.reference_file import Reference, find_reference, read_reference, write_reference
 from olpm_bench.bench.run import reference_folders
+from olpm_bench.transport import headroom
 
 ESTIMATOR = "path, unguided"
 SAVE_SECONDS = 30.0
@@ -99,6 +100,8 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
     with locked(folder) as alive:
         halves = Halves.start(spec.scene.width, spec.scene.height,
                               find_reference(key, reference_folders(experiment, root)))
+        pixels = spec.scene.width * spec.scene.height
+        headroom.require(pixels * 3 * 8 * 8, f"the halves of a reference of {pixels} pixels", "a smaller image")
         scene = cell.load_scene(spec)
         integrator = mi.load_dict({"type": "path", "max_depth": experiment.max_depth(spec.scene), "rr_depth": 5})
         meta = {"key": key, "scene": spec.scene.name, "width": spec.scene.width, "height": spec.scene.height,

@@ -59,6 +59,8 @@ def read_reference(path: Path, width: int, height: int) -> Reference:
     """
     if path.is_file():
         parts, _ = read_exr(path)
+        if "a.mean" in parts:           # one of ours, by the name of its file
+            return read_reference(path.parent, width, height)
         image = next(iter(parts.values()))
         if image.shape[2] != 3:
             raise ResultError(f"reference {path} has no RGB image")

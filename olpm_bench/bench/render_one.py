@@ -115,6 +115,9 @@ def render(spec: CellSpec, out: Path, *, save_guide: Path | None = None,
             raise ConfigError(f"{path}: there is no folder {path.parent}")
         if path is not None:
             check_writable(path.parent)
+    written = [path.resolve() for path in (out, out.with_suffix(".png"), save_guide, records_map) if path is not None]
+    if len(set(written)) < len(written):
+        raise ConfigError("--out, the PNG beside it, --save-guide and --records-map: two of them are the same file")
     require_memory([spec])
     guide = _load_guide(load_guide, spec) if load_guide is not None else None
     scene = load_scene(spec)

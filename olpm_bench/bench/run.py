@@ -243,7 +243,7 @@ def report(experiment: Experiment, root: Path, only: Sequence[str] = ()) -> None
     found = finished.read(experiment, results, references(experiment, root))
     summarised = summary.summarise(found)
     summary.print_table(summarised)
-    if experiment.budget.seconds is not None and len(found.machines) > 1:
+    if len(found.machines) > 1:
         print(f"made on different machines, whose seconds do not compare: {'; '.join(found.machines)}")
     if len(experiment.method) > 1:
         summary.print_speed_ups(found.speed_ups, experiment.baseline_name)

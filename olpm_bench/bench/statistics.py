@@ -5,7 +5,6 @@ there, and never beyond what was measured.  Seeds are paired: seed i of one meth
 """
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -27,18 +26,15 @@ class Band(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """An estimate and its interval (90 %), NaN where there is none or it is open."""
+    """An estimate and its interval (90 %), NaN where there is none."""
     value: float
     low: float
     high: float
     bound: str = ""         # ">": at least the value; "<": at most
 
     def ends(self, dash: str = "-") -> str:
-        """The interval in brackets, after a space; empty where there is none, or a bound in place of the estimate."""
-        low, high = (f"{end:.2g}" if np.isfinite(end) else "" for end in (self.low, self.high))
-        if self.bound or not (low or high):
-            return ""
-        return f" ({low}{dash}{high})" if low and high else f" (>{low})" if low else f" (<{high})"
+        """The interval in brackets, after a space; empty where there is none."""
+        return f" ({self.low:.2g}{dash}{self.high:.2g})" if np.isfinite([self.low, self.high]).all() else ""
 
 
 class Curve(NamedTuple):
@@ -123,40 +119,39 @@ def time_to_error(times: np.ndarray, errors: np.ndarray, error: float) -> float:
     return float(np.exp(np.interp(-np.log(error), -log_e, log_t)))
 
 
-def bootstrap(statistic: Callable[[np.ndarray], float], n: int, seed: int = 0, least: int = 1,
+def bootstrap(statistic: Callable[[np.ndarray], float], n: int, seed: int = 0,
               band: tuple[float, float] = BAND) -> Interval:
     """Percentile bootstrap of a statistic of seeds, which gets their numbers (n,) and so resamples methods in pairs.
 
     Args:
-        least: different seeds that the statistic needs; resamples with fewer are left out.
         band: percentiles of the resampled statistic that bound the interval.
 
     Returns:
-        The interval is NaN with `least` seeds or fewer, and where some resample has no value.
+        The interval is NaN with a single seed, and where some resample has no value.
     """
     value = float(statistic(np.arange(n)))
-    if n <= least:
+    if n == 1:
         return Interval(value, float("nan"), float("nan"))
     drawn = np.random.default_rng(seed).integers(0, n, (RESAMPLES, n))
-    low, high = np.percentile([statistic(index) for index in drawn if len(np.unique(index)) >= least], band)
+    low, high = np.percentile([statistic(index) for index in drawn], band)
     return Interval(value, float(low), float(high))
 
 
-def jackknife(statistic: Callable[[np.ndarray], float], n: int, least: int = 1, confidence: float = BAND[1] / 100) -> Interval:
+def jackknife(statistic: Callable[[np.ndarray], float], n: int, confidence: float = BAND[1] / 100) -> Interval:
     """Interval of a positive statistic of seeds from its logarithm without one of them at a time (Tukey 1958), by Student's t.
 
     For statistics that count how often a seed was drawn, as variances do: a bootstrap draws some twice.
 
     Args:
-        statistic, n, least: as in `bootstrap`.
+        statistic, n: as in `bootstrap`.
         confidence: that of each end.
 
     Returns:
-        The interval is NaN with `least` seeds or fewer, and where the statistic without some seed has no logarithm.
+        The interval is NaN with two seeds or fewer, and where the statistic without some seed has no logarithm.
     """
     seeds = np.arange(n)
     value = float(statistic(seeds))
-    if n <= least:
+    if n <= 2:
         return Interval(value, float("nan"), float("nan"))
     with np.errstate(invalid="ignore", divide="ignore"):
         without = np.log([statistic(np.delete(seeds, i)) for i in seeds])
@@ -176,22 +171,21 @@ def expanded_band(confidence: float, n: int) -> tuple[float, float]:
 
 
 def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Interval:
-    """Time of the baseline over time of the method at equal error (medians), with a paired bootstrap interval.
+    """Time of the baseline over time of the method at equal error (geometric mean over seeds), with a paired jackknife interval.
 
     Args:
-        error: the error to reach; by default the lowest that both curves reach, found anew in each resample.
+        error: the error to reach; by default the lowest that both curves reach, found anew without each seed.
 
     Returns:
-        NaN where one of them does not reach the error, or both start below it.  Where only one starts below, the
-        ratio with its first time bounds the speed-up, and `bound` says from which side; where so many resamples are
-        bounded that an end of the interval is, too, that end is NaN.
+        NaN where one of them does not reach the error, or both start below it.  Where only one starts below, the ratio with its
+        first time bounds the speed-up, and `bound` says from which side.  No interval where a seed less makes that so, nor with
+        two seeds, as for gains.
     """
     _paired(baseline, method)
     n = len(method.errors)
 
-    @functools.cache
-    def ratio(*index: int) -> tuple[float, str]:
-        a, b = (np.median(curve.errors[list(index)], axis=0) for curve in (baseline, method))
+    def ratio(index: np.ndarray) -> tuple[float, str]:
+        a, b = (np.exp(np.log(curve.errors[index]).mean(axis=0)) for curve in (baseline, method))
         level = max(a.min(), b.min()) if error is None else error
         below = a[0] < level, b[0] < level
         if all(below):
@@ -200,16 +194,12 @@ def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Inte
         time_b = method.times[0] if below[1] else time_to_error(method.times, b, level)
         return float(time_a / time_b), "<" if below[0] else ">" if below[1] else ""
 
-    def end(bound: str, infinite: float) -> Interval:
-        """The interval when bounds of one kind are as far off as they can be."""
-        def of_resample(index: np.ndarray) -> float:
-            value, found = ratio(*np.sort(index))
-            return infinite if found == bound else value
-        with np.errstate(invalid="ignore"):         # between infinities
-            return bootstrap(of_resample, n)
-    value, bound = ratio(*range(n))
-    low, high = end("<", -np.inf).low, end(">", np.inf).high
-    return Interval(value, low if np.isfinite(low) else float("nan"), high if np.isfinite(high) else float("nan"), bound)
+    def measured(index: np.ndarray) -> float:
+        value, bound = ratio(index)
+        return value if not bound else float("nan")
+    interval = jackknife(measured, n)
+    value, bound = ratio(np.arange(n))
+    return interval._replace(value=value, bound=bound)
 
 
 def gain(baseline: Work, method: Work) -> Interval:
@@ -225,7 +215,7 @@ def gain(baseline: Work, method: Work) -> Interval:
     def ratio(index: np.ndarray) -> float:
         a, b = (metrics.relative_variance(work.luminance[index]) * work.seconds[index].mean() for work in (baseline, method))
         return float(a / b) if b > 0 else float("nan")
-    return jackknife(ratio, len(method.seconds), least=2)
+    return jackknife(ratio, len(method.seconds))
 
 
 def _paired(a: Curve, b: Curve) -> None:

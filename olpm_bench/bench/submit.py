@@ -99,16 +99,17 @@ def wait(jobs: list[submitit.Job[list[str]]], experiment: Experiment, root: Path
     """
     results = Results(root / experiment.stem)
     cells = [results.cell_folder(spec.scene.name, spec.method.name, spec.seed) for spec in experiment.cells()]
-    end = math.inf
+    complete, end, heard = 0, math.inf, time.monotonic()
     try:
         with Bar(len(cells)) as bar:
             while running := [job for job in jobs if not job.done()]:
-                complete = sum((cell / "cell.json").exists() for cell in cells)
+                now, before, complete = time.monotonic(), complete, sum((cell / "cell.json").exists() for cell in cells)
                 bar.at(complete, f"{complete} of {len(cells)} cells, {len(running)} workers")
-                silent = [seconds for cell in cells if math.isfinite(seconds := silence(cell) or math.inf)]
+                signs = [now - seconds for seconds in map(silence, cells) if seconds is not None]
+                heard = now if complete > before else max([heard, *signs])
                 if end == math.inf and any(_is_content(job) for job in jobs if job not in running):
-                    end = time.monotonic() + GRACE
-                if time.monotonic() > end or (silent and min(silent) > LEASE):
+                    end = now + GRACE
+                if now > min(end, heard + LEASE):
                     bar.say(f"{len(running)} of {len(jobs)} workers hang and are stopped")
                     break
                 time.sleep(POLL)

@@ -17,6 +17,8 @@ from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
 from olpm_bench.bench.results import Cell, Results
 
+LATE = 0.05                 # share of a budget in seconds by which a cell may exceed it, before that is said
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -59,11 +61,13 @@ def summarise(finished: Finished) -> dict[str, Any]:
     """The summary of an experiment: ``{"schema_version", "rows"}``, one row a scene and method, in the TOML's order.
 
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
-    `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, `invalid_pixels` is the
-    sum.  `gain` is the baseline's work-normalised variance over the method's, with its 90 % jackknife interval.  What has no
-    value (a spread of one seed, the error of an image with NaN or of a scene without reference) is None.
+    `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, and `overrun` is the
+    largest share by which a cell exceeds a budget in seconds.  `gain` is the baseline's work-normalised variance over the
+    method's, with its 90 % jackknife interval.  What has no value (a spread of one seed, the error of a scene without reference)
+    is None.
     """
-    rows = [_row(scene.scene.name, method, scene.cells[method], final)
+    budget = finished.experiment.budget.seconds
+    rows = [_row(scene.scene.name, method, scene.cells[method], final, budget)
             for scene in finished.scenes for method, final in scene.final.items()]
     return {"schema_version": SCHEMA_VERSION, "rows": rows}
 
@@ -74,10 +78,10 @@ def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work
     return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
 
 
-def _row(scene: str, method: str, cells: Sequence[Cell], final: Final) -> dict[str, Any]:
+def _row(scene: str, method: str, cells: Sequence[Cell], final: Final, budget: float | None) -> dict[str, Any]:
     info = {key: np.array([cell.info[key] for cell in cells], np.float64) for key in (      # null becomes NaN
         "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
-        "bytes_per_record", "particles", "invalid_pixels", "mean", "mean_stderr")}
+        "bytes_per_record", "particles", "mean", "mean_stderr", "charged_seconds")}
     l1, gain = statistics.median_band(final.errors["l1"]), final.gain
     return plain({
         "scene": scene, "method": method, "seeds": [cell.seed for cell in cells],
@@ -86,12 +90,14 @@ def _row(scene: str, method: str, cells: Sequence[Cell], final: Final) -> dict[s
         "work_normalised_variance": final.work_normalised_variance,
         "gain": gain.value, "gain_low": gain.low, "gain_high": gain.high, "mean": np.mean(info["mean"]),
         "mean_stderr": np.sqrt(np.sum(info["mean_stderr"] ** 2)) / len(cells),      # seeds are independent
+        "charged_seconds": np.median(info["charged_seconds"]),
+        "overrun": np.max(info["charged_seconds"]) / budget - 1 if budget is not None else None,
         "training_passes": _whole(np.median(info["training_passes"])),
         "train_seconds": np.median(info["train_seconds"]), "render_seconds": np.median(info["render_seconds"]),
         "compile_seconds": np.max(info["compile_seconds"]), "wait_fraction": np.max(info["wait_fraction"]),
         "spp": _whole(np.median(info["spp"])), "records": _whole(np.median(info["records"])),
         "bytes_per_record": _whole(np.median(info["bytes_per_record"])),
-        "particles": _whole(np.median(info["particles"])), "invalid_pixels": _whole(np.sum(info["invalid_pixels"])),
+        "particles": _whole(np.median(info["particles"])),
     })
 
 
@@ -136,8 +142,8 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
             label = f"{scene} / {row['method']}"
             if row["wait_fraction"] > WAITED:
                 notes.append(f"{label}: waited {row['wait_fraction']:.0%} of its time for a busy core")
-            if row["invalid_pixels"]:
-                notes.append(f"{label}: {row['invalid_pixels']} pixels are NaN, infinite or negative")
+            if row["overrun"] is not None and row["overrun"] > LATE:
+                notes.append(f"{label}: took {row['overrun']:.0%} more time than its budget")
     console = console or Console()
     print_whole(table, console)
     for note in notes:

@@ -71,6 +71,7 @@ def curves(found: Finished) -> list[str]:
     several = len(experiment.scene) * len(axes) > 1
     panels = [_panel(scene.scene.name if several else experiment.title, scene, over, experiment)
               for scene in found.compared for over in axes]
+    panels = [panel for panel in panels if panel.curves]
     if not panels:
         return []
     faint = any((curve.median < NEAR_FLOOR * panel.floor).any() for panel in panels for curve in panel.curves.values())
@@ -83,10 +84,10 @@ def curves(found: Finished) -> list[str]:
 def _panel(title: str, scene: FinishedScene, over: str, experiment: Experiment) -> Panel:
     assert scene.reference is not None
     shown, curves, floor = [method.name for method in experiment.shown], scene.curves(over), scene.reference.noise_floor or 0.0
-    curves = {name: curves[name] for name in shown}
+    curves = {name: curves[name] for name in shown if name in curves}
     if over == "spp":
         return Panel(title, curves, experiment.looks, {}, float(experiment.budget.spp or 0), floor, abscissa="samples per pixel")
-    ended: dict[str, list[Any]] = {name: [cell.info.get("training_ended") for cell in scene.cells[name]] for name in shown}
+    ended: dict[str, list[Any]] = {name: [cell.info.get("training_ended") for cell in scene.cells[name]] for name in curves}
     return Panel(title, curves, experiment.looks,
                  {name: float(np.median(times)) for name, times in ended.items() if None not in times},
                  experiment.budget.seconds, floor, {name: scene.speed_ups[name] for name in shown if name in scene.speed_ups})

@@ -131,11 +131,14 @@ class Passes:
 
     def run(self):
         for index in range(self.passes):
-            yield self.camera_pass(index >= 2)
+            yield self._pass(index, index >= 2)
 
-    def camera_pass(self, renders=True):
-        index, self.learnt = self.learnt, self.learnt + 1
-        image = SimpleNamespace(numpy=lambda: np.full((12, 16, 3), float(index))) if renders else None
+    def camera_pass(self):
+        return self._pass(self.passes, True)
+
+    def _pass(self, index, renders):
+        before, self.learnt = self.learnt, self.learnt + 1
+        image = SimpleNamespace(numpy=lambda: np.full((12, 16, 3), float(before))) if renders else None
         return PassStatistics(index, self.passes, spp=4 if renders else 0, seen=self.learnt * self.seen if renders else 0.0,
                               seconds={"trace": 0.3, "update": 0.1}, image=image)
 
@@ -184,18 +187,20 @@ def test_without_blending_no_training_image_enters(trained):
 
 
 @pytest.mark.parametrize("while_rendering", ["true", "false"])
-@pytest.mark.parametrize("spp", [1, 3, 11, 16, 37])
+@pytest.mark.parametrize("spp", [1, 3, 8, 11, 16, 37])
 def test_budgets_in_samples_are_met_exactly(trained, spp, while_rendering):
     done = trained(f"spp = {spp}", f"camera_passes = 6, while_rendering = {while_rendering}")
     assert done.info["spp"] == spp == done.trace[-1]["spp"] and (done.image["count"] == spp).all()
+    assert (np.diff([line["spp"] for line in done.trace]) > 0).all() and len(done.trace) == len(done.checkpoints)
     blended = min(spp // 4, 4)                                          # the second half of 8 passes, as far as there is room
-    passes = done.info["training_passes"] - 8
-    assert passes == ((spp - 4 * blended) // 4 if while_rendering == "true" else 0)
+    assert done.info["training_passes"] == 8
+    assert len(done.info["passes"]) - 8 == ((spp - 4 * blended) // 4 if while_rendering == "true" else 0)
 
 
 def test_the_guide_learns_on_while_rendering(trained):
     done = trained("seconds = 20", "share = 0.2, camera_passes = 30, while_rendering = true")
-    assert done.info["training_passes"] == 20 and done.info["spp"] == 4 * 18       # 2 of 4 passes of training, all of rendering
+    assert (done.info["training_passes"], len(done.info["passes"])) == (4, 20)
+    assert done.info["spp"] == 4 * 18               # 2 of 4 passes of training, all of rendering
     assert done.info["render_seconds"] == pytest.approx(18 * 0.75)
 
 

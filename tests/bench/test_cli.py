@@ -95,6 +95,16 @@ def test_list_shows_scenes_representations_and_experiments(monkeypatch):
         assert word in result.output
 
 
+def test_list_survives_what_lies_in_the_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("experiments").mkdir()
+    Path("experiments/deep.toml").write_text("a = " + 5000 * "[" + 5000 * "]")
+    Path("experiments/steers.toml").write_text('title = "\\u001b[2J cleared"')
+    result = call("list")
+    assert result.exit_code == 0 and "deep.toml: cannot be read" in result.output
+    assert "\x1b" not in result.output and "cleared" in result.output
+
+
 # ---------------------------------------------------------------- run
 
 def test_run_prints_the_table_and_writes_the_report_and_report_does_so_again(experiment, tmp_path, monkeypatch):
@@ -312,6 +322,7 @@ RENDER = ("render", "cornell_box", "--spp", "1", "--out", "x.exr")
     (("render", "no_scene", "--spp", "1", "--out", "x.exr", "--method", "unguided"), ["no_scene", "cornell_box"]),
     (("render", "cornell_box", "--spp", "1", "--out", "x.png", "--method", "unguided"), ["x.png", ".exr"]),
     (("render", "cornell_box", "--spp", "1", "--out", "no/x.exr", "--method", "unguided"), ["no folder no"]),
+    ((*RENDER, "--method", "cosine", "--records-map", "./x.png"), ["the PNG beside it", "the same file"]),
     (("fit", "--representation", "gmm", "--samples", "s.npz", "--heldout", "h.npz"), ["unknown representation 'gmm'"]),
     (("fit", "--representation", "cosine", "--samples", "s.npz", "--heldout", "h.npz"), ["s.npz"]),
     (("fit", "--representation", "cosine", "--set", "training.passes=1", "--samples", "s.npz", "--heldout", "h.npz"),

@@ -44,7 +44,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     for spec in experiment.cells():
         image = truth + np.float32(0.1 * (spec.seed + 1))
         numbers = ("spp", "charged_seconds", "training_passes", "train_seconds", "render_seconds", "compile_seconds",
-                   "wait_fraction", "records", "bytes_per_record", "particles", "invalid_pixels", "mean", "mean_stderr")
+                   "wait_fraction", "records", "bytes_per_record", "particles", "mean", "mean_stderr")
         results.write_cell("cornell_box", spec.method.name, spec.seed, {"key": "older", **dict.fromkeys(numbers, 1.0)},
                            [{"seconds": 1.0, "spp": 4}], {"mean": image, "variance": truth, "count": truth[..., 0]}, [image],
                            spec.config())
@@ -83,7 +83,7 @@ def test_the_toml_names_its_results_too(folder, tmp_path):
 @pytest.mark.parametrize("arguments, words", [
     (("nowhere",), ["nowhere", "no such file"]),
     (("known.toml", "--results", "elsewhere"), ["cell cornell_box / Path tracing / seed 0 in elsewhere/known is missing"]),
-    ((".",), ["experiment.toml", "no such file"]),
+    ((".",), ["no folder of results", "experiment.toml"]),
 ])
 def test_bad_input_is_one_line_and_exit_code_2(folder, tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)

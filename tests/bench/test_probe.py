@@ -28,6 +28,16 @@ def test_a_process_that_dies_or_hangs_is_started_again():
         assert process.process is None
 
 
+def test_nothing_is_imported_from_the_folder_that_one_works_in(tmp_path, monkeypatch):
+    """A downloaded scene may have a json.py beside it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "json.py").write_text("open('was_run', 'w')")
+    (tmp_path / "room.xml").write_text("<scene")
+    with probe.Process() as process:
+        assert "refused" in process.ask("room.xml", {})
+    assert not (tmp_path / "was_run").exists()
+
+
 @pytest.mark.parametrize("answer, message", [
     ({"died": -11}, r"room\.xml: Mitsuba crashes when it loads it \(SIGSEGV\)"), ({"died": 1}, r"room\.xml: .* \(exit code 1\)"),
     ({"hung": 900.0}, r"room\.xml: Mitsuba has not loaded it after 900 s"), ({"refused": "no such scene"}, "^no such scene$")])

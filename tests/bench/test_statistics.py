@@ -90,16 +90,24 @@ def test_speed_up_only_where_both_curves_reach_the_error():
         statistics.speed_up(slow, curve(1, 2, 3))
 
 
-def test_an_end_of_a_speed_up_that_was_not_measured_is_open():
-    """In 3 of 10 resamples of 5 seeds the fast curve starts below the error: the speed-up is more than its first time says."""
+def test_a_speed_up_that_a_seed_less_leaves_unmeasured_has_no_interval():
+    """Without the slowest of its seeds the fast curve starts below the error: the speed-up is more than its first time says."""
     slow, fast = curve(3.8, 3.9, 4, 4.1, 4.2), curve(2.3, 2.4, 2.6, 2.7, 2.8)
-    faster, slower = statistics.speed_up(slow, fast, error=2.5), statistics.speed_up(fast, slow, error=2.5)
-    assert faster.value == pytest.approx((4 / 2.6) ** 2) and faster.bound == slower.bound == ""
-    assert 1 < faster.low < faster.value and np.isnan(faster.high)
-    assert np.isnan(slower.low) and slower.value < slower.high < 1
-    assert faster.ends() == f" (>{faster.low:.2g})" and slower.ends() == f" (<{slower.high:.2g})"
-    assert faster._replace(high=9).ends("~") == f" ({faster.low:.2g}~9)" and faster._replace(bound=">").ends() == ""
-    assert statistics.speed_up(curve(4), curve(2)).ends() == ""             # one seed
+    known, unknown = statistics.speed_up(slow, fast, error=2.2), statistics.speed_up(slow, fast, error=2.5)
+    assert known.low < known.value < known.high and known.ends("~") == f" ({known.low:.2g}~{known.high:.2g})"
+    assert 2 < unknown.value < 3 and unknown.bound == "" == unknown.ends()
+    assert statistics.speed_up(curve(4), curve(2)).ends() == statistics.speed_up(curve(4, 5), curve(2, 3)).ends() == ""
+
+
+@pytest.mark.parametrize("n", [3, 6])
+def test_intervals_of_speed_ups_cover_it(n):
+    """Of 90 % intervals at least 85 % and not all hold the truth, 4, with errors that differ by 5 % from seed to seed."""
+    rng, held, runs = np.random.default_rng(9), 0, 200
+    for _ in range(runs):
+        slow, fast = (curve(*(error * np.exp(0.05 * rng.standard_normal(n)))) for error in (4, 2))
+        interval = statistics.speed_up(slow, fast)
+        held += interval.low <= 4 <= interval.high
+    assert 0.85 * runs <= held < runs
 
 
 def test_pairing_removes_what_the_seeds_share():

@@ -17,8 +17,9 @@ from olpm_bench.bench.results import Results
 from olpm_bench.transport.settings import IntegratorSettings
 
 KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "mape", "smape", "relmse", "relmse_trimmed", "flip", "ssim_error",
-        "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "training_passes", "train_seconds",
-        "render_seconds", "compile_seconds", "wait_fraction", "spp", "records", "bytes_per_record", "particles", "invalid_pixels"]
+        "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "charged_seconds", "overrun",
+        "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
+        "bytes_per_record", "particles"]
 ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
 TIMES = [1.0, 4.0, 16.0]
 
@@ -36,7 +37,7 @@ def folder(tmp_path, errors: dict[str, list[float]], seeds: list[int]) -> Simple
         images = [truth + np.float32(error * np.sqrt(16 / t)) for t in TIMES]
         info = {"key": cell.key, "spp": 100 + i, "charged_seconds": 16.0, "training_passes": 3 + i, "train_seconds": 2.0 + i,
                 "render_seconds": 14.0 - i, "compile_seconds": 5.0 if i == 0 else 0.0, "wait_fraction": 0.1 * i,
-                "records": 1000 + i, "bytes_per_record": 256, "particles": 50_000, "invalid_pixels": 0,
+                "records": 1000 + i, "bytes_per_record": 256, "particles": 50_000,
                 "mean": 1 + error, "mean_stderr": 0.3}
         trace = [{"seconds": t, "spp": t} for t in TIMES]
         results.write_cell(cell.scene.name, cell.method.name, cell.seed, info, trace,
@@ -73,7 +74,7 @@ def test_figures_over_seeds(known):
     assert (row["train_seconds"], row["render_seconds"]) == (3, 13)
     assert (row["compile_seconds"], row["wait_fraction"]) == (5, 0.2)
     assert (row["spp"], row["records"], row["bytes_per_record"], row["particles"]) == (101, 1001, 256, 50_000)
-    assert row["invalid_pixels"] == 0 and isinstance(row["spp"], int)
+    assert isinstance(row["spp"], int) and (row["charged_seconds"], row["overrun"]) == (16, 0)
 
 
 def test_every_metric_is_a_median_over_seeds(known):
@@ -110,6 +111,22 @@ def test_a_scene_without_reference_has_no_errors_but_all_the_rest(known):
     summary.print_table({"rows": rows}, console)
     shown = console.file.getvalue().splitlines()[2].split()
     assert shown[:6] == ["Slow", "-", "-", "-", "-", summary.number(rows[0]["work_normalised_variance"])]
+
+
+def test_images_without_error_have_no_curve_and_no_speed_up(tmp_path):
+    """As of a room whose lamps have no power; the table still stands."""
+    black = folder(tmp_path, {"Slow": [0.0, 0.0, 0.0], "Fast": [0.2, 0.25, 0.45]}, [4, 5, 7])
+    found = finished.read(black.experiment, black.results, black.references)
+    assert list(found.scenes[0].curves()) == ["Fast"] and np.isnan(found.speed_ups["Fast"]["door_ajar"].value)
+    assert [row["l1"] for row in summarised(black)["rows"]] == [0, pytest.approx(0.25, rel=1e-5)]
+    assert any("shares no L1 error" in line for line in summary.speed_up_lines(found.speed_ups, "Slow"))
+
+
+def test_cells_that_exceed_their_budget_are_named(known, capsys):
+    result = summarised(known)
+    result["rows"][1]["overrun"] = 0.4
+    summary.print_table(result)
+    assert "door_ajar / Fast: took 40% more time than its budget" in capsys.readouterr().out
 
 
 def test_gains_and_speed_ups_are_over_the_baseline(known):
@@ -166,7 +183,7 @@ def test_speed_up_over_the_first_method_at_equal_error(known):
 
 
 def test_speed_ups_over_scenes_are_averaged_where_all_are_known():
-    known, bounded = statistics.Interval(2, 1.5, 2.5), statistics.Interval(8, 7, 9, ">")
+    known, bounded = statistics.Interval(2, 1.5, 2.5), statistics.Interval(8, np.nan, np.nan, ">")
     console = Console(file=io.StringIO())
     found = {"A": {"x": known, "y": known._replace(value=8)}, "B": {"x": known, "y": bounded}}
     summary.print_speed_ups(found, "PT", console)
