@@ -35,8 +35,8 @@ def examine(subject: Subject, checks: Sequence[Check], folder: Path, quiet: bool
         verdicts.print_table(outcomes, pictures, console)
         failed = sum(not o.verdict.passed for o in outcomes)
         result = f"{failed} of {len(outcomes)} checks FAILED" if failed else f"{len(outcomes)} checks passed"
-        verdicts.line(console, f"{subject.name}: {result} in {seconds:.0f} s (seed {subject.seed}; by chance, one such run in "
-                      f"{1 / LEVEL:.0f} fails)", "bold red" if failed else "bold green")
+        verdicts.line(console, f"{subject.name}: {result} in {seconds:.0f} s (seed {subject.seed}; designed for one "
+                      f"false alarm in {1 / LEVEL:.0f} such runs)", "bold red" if failed else "bold green")
     found = [{"name": o.check.name, "sentence": o.check.sentence, **o.verdict.as_dict(), "seconds": o.seconds,
               "picture": pictures.get(o.check.name)} for o in outcomes]
     return {"representation": subject.specification, "seed": subject.seed, "declared": list(subject.declared), "passed": passed,
@@ -98,13 +98,13 @@ def _logged(log: Path | None, about: dict[str, Any]) -> dict[int, dict[str, Any]
     Raises:
         ResultError: a line that is none of ours.
     """
-    found = {}
-    for number, line in enumerate(log.read_text(encoding="utf-8").splitlines() if log and log.exists() else [], 1):
+    found, text = {}, log.read_text(encoding="utf-8", errors="replace") if log and log.exists() else ""
+    for number, line in enumerate(text.splitlines(), 1):
         try:
             run = json.loads(line)
             if all(run[key] == value for key, value in about.items()):
                 found[int(run["seed"])] = {**run, "passed": bool(run["passed"]), "p": float(run["p"])}
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             raise ResultError(f"{log}: line {number} is broken; remove it") from None
     return found
 

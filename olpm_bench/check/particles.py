@@ -1,6 +1,7 @@
 """The particles that representations are trained on: the states in which a density must be one."""
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 
 import mitsuba as mi
@@ -87,8 +88,11 @@ CONDITIONS: dict[str, Condition] = {
 
 
 def landing(wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where on a disk of radius 0.1 around the record each particle has landed [n, 3], and its distance [n], some infinite."""
-    rng = np.random.default_rng([11, len(wo)])
+    """Where on a disk of radius 0.1 around the record each particle has landed [n, 3], and its distance [n], some infinite.
+
+    The same for the same directions.
+    """
+    rng = np.random.default_rng([11, zlib.crc32(wo.tobytes())])
     phi, r = 2 * np.pi * rng.random(len(wo)), 0.1 * np.sqrt(rng.random(len(wo)))
     distance = np.where(rng.random(len(wo)) < 0.8, 10 ** rng.uniform(-1.5, 1.5, len(wo)), np.inf)
     return np.stack([r * np.cos(phi), r * np.sin(phi), 0.01 * rng.normal(size=len(wo))], -1), distance
@@ -102,6 +106,6 @@ def batch(particles: list[Particles], parallax: bool = False) -> ParticleBatch:
     record = np.repeat(np.arange(len(particles), dtype=np.uint32), [len(p[1]) for p in particles])
     if not parallax:
         return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles))
-    at, distance = (np.concatenate([landing(p[0])[i] for p in particles]).astype(np.float32) for i in (0, 1))
+    at, distance = (np.concatenate(values).astype(np.float32) for values in zip(*(landing(p[0]) for p in particles), strict=True))
     return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles), mi.Float(distance),
                                      vector(at))

@@ -34,18 +34,18 @@ CELL = 2 * (2 / CELLS) ** 2         # solid angle of a cell [sr]: the disk's are
 def of_record(trained: Trained, record: int, worst: np.ndarray | None = None) -> Picture:
     """Cell means of pdf(), the histogram of samples, and their difference in standard deviations; `worst` is marked."""
     def panels() -> list[Panel]:
-        rng, people = trained.people.rng(6), trained.people
+        rng, records = trained.records.rng(6), trained.records
         index = np.full(DIRECTIONS, record)
-        y = people.proposals.at(index, rng.random((DIRECTIONS, 3)))
+        y = records.proposals.at(index, rng.random((DIRECTIONS, 3)))
         y = y[y[:, 2] > 0]
-        share = trained.density(index[:len(y)], y) / people.proposals.pdf(index[:len(y)], y) / DIRECTIONS
+        share = trained.density(index[:len(y)], y) / records.proposals.pdf(index[:len(y)], y) / DIRECTIONS
         x = trained.draw(index, rng)
         x, one = x.wo[x.alive], np.full(x.alive.sum(), 1 / DIRECTIONS)
         expected, sampled = over_disk(y, np.nan_to_num(share)), over_disk(x, one)
         error = np.sqrt((over_disk(y, np.nan_to_num(share) ** 2) + over_disk(x, one**2)) / CELL)
         z = np.divide(sampled - expected, error, out=np.where(np.isnan(error), np.nan, 0.0), where=error > 0)
         mark = None if worst is None else (float(to_disk(worst)[0]), float(to_disk(worst)[1]))
-        return [Panel(f"pdf of {people.name(record)}", expected, mark=mark),
+        return [Panel(f"pdf of {records.name(record)}", expected, mark=mark),
                 Panel(f"histogram of {DIRECTIONS} samples", sampled, mark=mark),
                 Panel("samples - pdf", z, "signed", "standard deviations", mark)]
     return panels

@@ -1,6 +1,9 @@
 """update() depends on nothing but its arguments, and on those only as the contract says."""
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
 from typing import Any
 
 import drjit as dr
@@ -8,63 +11,86 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
+import representations
 from olpm_bench.check.density import ROUNDING, direction
 from olpm_bench.check.particles import Particles, batch, lobes, many, normalised, nothing, uniform_directions, vector
 from olpm_bench.check.picture import of_density
 from olpm_bench.check.population import population
 from olpm_bench.check.trained import as_numpy
-from olpm_bench.check.verdict import Failure, Picture, PValues, Verdict, exact
-from representations.state import append, to_numpy
+from olpm_bench.check.verdict import Failure, Picture, PValues, Verdict, combined, exact, sidak
+from representations.interface import ParticleBatch
+from representations.state import append, copied, from_numpy, to_numpy
 
 COPIES = 2                  # records in each condition
 QUERIES = 256               # directions at which densities are compared, for each record
-CROWD = 256                 # records whose order is changed
-CROWD_QUERIES = 64
+REORDERED = 256             # records whose order is changed
+FEWER_QUERIES = 64          # for each of those
+BESIDE = (0.05, -0.03, 0.01)        # where states with parallax are asked [scene units]; particles land within 0.1
 FAINT = 1e-6                # densities [1/sr] and differences of densities that count as nothing
 
 
 class Trials:
-    """Trainings of the same representation on variations of the same particles."""
+    """Trainings of the same representation on variations of the same particles.
 
-    def __init__(self, representation: Any, seed: int) -> None:
-        self.representation, self.seed = representation, seed
-        self.people = population(seed, COPIES, million=False)
-        self.batches, self.n = self.people.batches, len(self.people)
-        rng, directions = self.people.rng(8), []
+    parallax: of states with parallax, which are asked from `BESIDE` the record.
+    grows: declared so.
+    """
+
+    def __init__(self, specification: dict[str, Any], seed: int, parallax: bool = False, grows: bool = False) -> None:
+        self.representation, self.another = (representations.create(**specification) for _ in range(2))
+        self.seed, self.parallax, self.grows = seed, parallax, grows
+        self.records = population(seed, COPIES, million=False)
+        self.batches, self.n = self.records.batches, len(self.records)
+        rng, directions = self.records.rng(8), []
         for r in range(self.n):
-            near = self.people.of(r)[0][:QUERIES // 2]
+            near = self.records.of(r)[0][:QUERIES // 2]
             near = normalised(near + 10 ** rng.uniform(-4, -1, (len(near), 1)) * rng.normal(size=near.shape))
             directions.append(np.concatenate([near, uniform_directions(QUERIES - len(near), rng)]))
         self.wo = np.stack(directions)          # [n, QUERIES, 3]
 
     def train(self, batches: list[list[Particles]], seed: int | None = None) -> Any:
         seed = self.seed if seed is None else seed
-        state = self.representation.init(len(batches[0]), seed)
+        state = self.init(len(batches[0]), seed)
         for index, particles in enumerate(batches):
-            state = self.representation.update(state, batch(particles), seed + index)
+            state = self.update(state, particles, seed + index)
             dr.eval(state)
         return state
 
-    def density(self, state: Any, index: np.ndarray, wo: np.ndarray) -> np.ndarray:
+    def init(self, n_records: int, seed: int) -> Any:
+        return self.representation.init(n_records, seed, self.parallax)
+
+    def update(self, state: Any, particles: list[Particles], seed: int) -> Any:
+        return self.representation.update(state, self.batch(particles), seed)
+
+    def batch(self, particles: list[Particles]) -> ParticleBatch:
+        return batch(particles, self.parallax)
+
+    def at(self, n: int) -> mi.Vector3f | None:
+        return vector(np.tile(BESIDE, (n, 1))) if self.parallax else None
+
+    def density(self, state: Any, index: np.ndarray, wo: np.ndarray, by: Any = None) -> np.ndarray:
         """Of the state's records `index` [n] at directions [n, m, 3]."""
-        record = mi.UInt32(np.repeat(index, wo.shape[1]).astype(np.uint32))
-        pdf = self.representation.pdf(state, record, vector(wo.reshape(-1, 3)))
-        return as_numpy(pdf, len(index) * wo.shape[1]).reshape(wo.shape[:2])
+        n, record = len(index) * wo.shape[1], mi.UInt32(np.repeat(index, wo.shape[1]).astype(np.uint32))
+        pdf = (by or self.representation).pdf(state, record, vector(wo.reshape(-1, 3)), True, self.at(n))
+        return as_numpy(pdf, n).reshape(wo.shape[:2])
 
     def differences(self, what: str, new: Any, old: Any, records: np.ndarray | None = None, new_at: int = 0, old_at: int = 0,
-                    bits: bool = False) -> list[Failure]:
-        """Between two states, in the densities of some records of the population; record r has the index `new_at` + r."""
+                    bits: bool = False, by: Any = None) -> list[Failure]:
+        """Between two states, in the densities of some records of the population; record r has the index `new_at` + r.
+
+        by: the instance that is asked for the new ones.
+        """
         records = np.arange(self.n) if records is None else records
         wo = self.wo[records]
-        found, expected = self.density(new, records + new_at, wo), self.density(old, records + old_at, wo)
+        found, expected = self.density(new, records + new_at, wo, by), self.density(old, records + old_at, wo)
         close = np.isclose(found, expected, rtol=0 if bits else ROUNDING, atol=0 if bits else FAINT)
         if close.all():
             return []
         r, i = (int(k[0]) for k in np.nonzero(~close))
         record = int(records[r])
-        words = (f"{self.people.name(record)}: {what}: pdf {found[r, i]:.5g} instead of {expected[r, i]:.5g} 1/sr at "
+        words = (f"{self.records.name(record)}: {what}: pdf {found[r, i]:.5g} instead of {expected[r, i]:.5g} 1/sr at "
                  f"{direction(wo[r, i])}; {(~close).sum()} of {close.size} densities differ")
-        return [Failure((~close).sum(), words, self.beside((f"pdf of {self.people.name(record)}", old, record + old_at),
+        return [Failure((~close).sum(), words, self.beside((f"pdf of {self.records.name(record)}", old, record + old_at),
                                                            (what, new, record + new_at)))]
 
     def beside(self, *shown: tuple[str, Any, int]) -> Picture:
@@ -73,29 +99,45 @@ class Trials:
                         for title, state, index in shown]
 
 
+def both(check: Callable[..., Verdict]) -> Callable[..., Verdict]:
+    """The check of states without and with parallax, in one verdict, that of the worse ones."""
+    @functools.wraps(check)
+    def of_both(trials: Sequence[Trials], *level: float) -> Verdict:
+        verdicts = [check(one, *(sidak(a, len(trials)) for a in level)) for one in trials]
+        worst = min(verdicts, key=lambda v: (v.passed, 1.0 if v.p is None else v.p))
+        words = "with parallax, " if worst is not verdicts[0] else ""
+        notes = dict.fromkeys(v.note for v in verdicts if v.note)
+        return replace(worst, worst=worst.worst and words + worst.worst, tests=len(trials) * worst.tests,
+                       p=None if worst.p is None else combined(worst.p, len(trials)), note="; with parallax: ".join(notes))
+    return of_both
+
+
+@both
 def stay_pure(trials: Trials) -> Verdict:
     """The arguments of the four verbs are left alone, and the same arguments give the same bits."""
     r, n, seed = trials.representation, trials.n, trials.seed
-    state, wrong = r.init(n, seed), []
-    if _differing(state, r.init(n, seed)):
+    state, wrong, pictures = trials.init(n, seed), [], []
+    if _differing(state, trials.init(n, seed)):
         wrong.append("init() with the same seed gives another state")
     record = mi.UInt32(np.repeat(np.arange(n, dtype=np.uint32), QUERIES))
-    wo, u = vector(trials.wo.reshape(-1, 3)), trials.people.rng(9).random((3, n * QUERIES), np.float32)
+    wo, u = vector(trials.wo.reshape(-1, 3)), trials.records.rng(9).random((3, n * QUERIES), np.float32)
+    at = trials.at(n * QUERIES)
     for number, particles in enumerate(trials.batches, 1):
         dr.eval(state)
-        given = batch(particles)
+        given = trials.batch(particles)
         before, given_before = _bits(state), _bits(given)
         new, again = (r.update(state, given, seed + number) for _ in range(2))
         dr.eval(new, again)
         if _differing(new, again):
             wrong.append(f"update number {number} with the same arguments gives other bits in {_differing(new, again)}")
+            pictures += [f.picture for f in trials.differences("once more", again, new, bits=True)]
         if _bits(state) != before:
             wrong.append(f"update number {number} changes the state that it was given, in place")
         if _bits(given) != given_before:
             wrong.append(f"update number {number} changes the particles that it was given")
         before = _bits(new)
-        drawn = [r.sample(new, record, mi.Float(u[0]), mi.Point2f(u[1], u[2])) for _ in range(2)]
-        asked = [(r.pdf(new, record, wo),) for _ in range(2)]
+        drawn = [r.sample(new, record, mi.Float(u[0]), mi.Point2f(u[1], u[2]), True, at) for _ in range(2)]
+        asked = [(r.pdf(new, record, wo, True, at),) for _ in range(2)]
         dr.eval(drawn, asked)
         for verb, (a, b) in (("sample()", drawn), ("pdf()", asked)):
             if not all(np.array_equal(np.array(x), np.array(y), equal_nan=True) for x, y in zip(a, b, strict=True)):
@@ -103,7 +145,7 @@ def stay_pure(trials: Trials) -> Verdict:
         if _bits(new) != before:
             wrong.append(f"sample() or pdf() changes the state after update number {number}")
         state = new
-    return exact([Failure(len(wrong), "; ".join(wrong))] if wrong else [], "violations",
+    return exact([Failure(len(wrong), "; ".join(wrong), next(iter(pictures), None))] if wrong else [], "violations",
                  f"{len(trials.batches)} updates of {n} records, each twice")
 
 
@@ -117,36 +159,46 @@ def _differing(a: Any, b: Any) -> str:
     return ", ".join(k for k in x if k not in y or x[k].tobytes() != y[k].tobytes())
 
 
+@both
 def ignore_scale(trials: Trials) -> Verdict:
     """Weights times a constant of each record give the same density."""
-    exponent = trials.people.rng(10).integers(-20, 21, trials.n)
+    exponent = trials.records.rng(10).integers(-20, 21, trials.n)
     scaled = [[(wo, weight * np.float32(2.0**e)) for (wo, weight), e in zip(particles, exponent, strict=True)]
               for particles in trials.batches]
     found = trials.differences("with its weights scaled", trials.train(scaled), trials.train(trials.batches))
     return exact(found, "densities that differ", f"weights of {trials.n} records scaled by 2^-20 to 2^20")
 
 
+@both
 def ignore_nothing(trials: Trials) -> Verdict:
     """A batch without particles, or with zero weights only, keeps every density."""
-    state, rng, found = trials.train(trials.batches), trials.people.rng(11), []
+    state, rng, found = trials.train(trials.batches), trials.records.rng(11), []
     for what, particles in (("after a batch without particles", [nothing()] * trials.n),
                             ("after particles of zero weight", [(lobes(50, rng), np.zeros(50, np.float32))] * trials.n)):
-        found += trials.differences(what, trials.representation.update(state, batch(particles), trials.seed + 7), state)
+        found += trials.differences(what, trials.update(state, particles, trials.seed + 7), state)
     return exact(found, "densities that differ", f"{trials.n} records, 2 batches with nothing to learn")
 
 
+@both
 def take_new_records(trials: Trials) -> Verdict:
-    """Records appended to a state begin as init() makes them, leave the old ones alone, and learn."""
-    r, old, new = trials.representation, np.arange(trials.n // 2), np.arange(trials.n // 2, trials.n)
+    """A state is arrays of so many numbers a record, and nothing else: it can be stored, and records can be appended to it, which
+    begin as init() makes them, leave the old ones alone, and learn.
+    """
+    old, new = np.arange(trials.n // 2), np.arange(trials.n // 2, trials.n)
     state = trials.train([particles[:len(old)] for particles in trials.batches])
-    fresh = r.init(len(new), trials.seed + 1)
-    longer = append(state, fresh)
-    found = trials.differences("with records appended to it", longer, state, old, bits=True)
+    fresh = trials.init(len(new), trials.seed + 1)
+    if wrong := _misfits(trials, state, len(old)):
+        return exact([Failure(len(wrong), "; ".join(wrong))], "fields that are no records")
+    like = trials.another.init(2, 0, trials.parallax)
+    stored = from_numpy(like, {k: copied(type(getattr(like, k)), v) for k, v in to_numpy(state).items()})
+    found = trials.differences("stored, and asked through another instance", stored, state, old, bits=True, by=trials.another)
+    longer = append(append(trials.init(0, trials.seed), state), fresh)
+    found += trials.differences("with records appended to it", longer, state, old, bits=True)
     found += trials.differences("appended", longer, fresh, new, old_at=-len(old), bits=True)
-    particles = [nothing()] * len(old) + [many(300, trials.people.rng(12))] * len(new)
-    taught = r.update(longer, batch(particles), trials.seed + 9)
+    particles = [nothing()] * len(old) + [many(300, trials.records.rng(12))] * len(new)
+    taught = trials.update(longer, particles, trials.seed + 9)
     found += trials.differences("when those appended to it learnt", taught, longer, old)
-    alone = r.update(fresh, batch(particles[len(old):]), trials.seed + 9)
+    alone = trials.update(fresh, particles[len(old):], trials.seed + 9)
     if not trials.differences("", alone, fresh, new, -len(old), -len(old)):
         return exact(found, "densities that differ", f"{len(old)} records, {len(new)} appended, which learn nothing anyway")
     if not trials.differences("", taught, longer, new):
@@ -154,9 +206,22 @@ def take_new_records(trials: Trials) -> Verdict:
     return exact(found, "densities that differ", f"{len(old)} records, {len(new)} appended")
 
 
+def _misfits(trials: Trials, state: Any, n: int) -> list[str]:
+    """What can't be cut into records, of a state of n."""
+    found, like = [], trials.init(2, trials.seed)
+    for field in fields(like):
+        of_two, array = getattr(like, field.name), getattr(state, field.name)
+        if not (dr.is_array_v(of_two) and dr.depth_v(of_two) == 1 and type(array) is type(of_two)):
+            found.append(f"{field.name} is {type(of_two).__name__} and, trained, {type(array).__name__}: no flat Dr.Jit array")
+        elif len(of_two) % 2 or (len(array) * 2 != len(of_two) * n and not trials.grows):
+            found.append(f"{field.name} has {len(of_two)} numbers for 2 records and, trained, {len(array)} for {n}")
+    return found
+
+
+@both
 def be_independent(trials: Trials, level: float) -> Verdict:
     """What a record learns doesn't depend on the particles of other records, nor on where among them it stands."""
-    rng = trials.people.rng(13)
+    rng = trials.records.rng(13)
     kept = rng.random(trials.n) < 0.5
     others = [[p if k else many(int(rng.integers(0, 100)), rng) for p, k in zip(particles, kept, strict=True)]
               for particles in trials.batches]
@@ -169,21 +234,21 @@ def _ignore_order(trials: Trials, rng: np.random.Generator, level: float) -> Ver
     """Permuted records give permuted densities, bit for bit; or, if random numbers go by the index of a record, they differ no
     more than by another seed: Wilcoxon's test of the distances, two for each record.
     """
-    particles, order, same = [many(200, rng) for _ in range(CROWD)], rng.permutation(CROWD), np.arange(CROWD)
-    wo = np.stack([p[0][:CROWD_QUERIES] for p in particles])
+    particles, order, same = [many(200, rng) for _ in range(REORDERED)], rng.permutation(REORDERED), np.arange(REORDERED)
+    wo = np.stack([p[0][:FEWER_QUERIES] for p in particles])
     base, reordered, reseeded = (trials.train([[particles[i] for i in o]], s) for o, s in (
         (same, trials.seed), (order, trials.seed), (same, trials.seed + 1000)))
     place = np.argsort(order)
     log_pdf = [np.log(np.maximum(trials.density(state, at, wo), FAINT)) for state, at in (
         (base, same), (reordered, place), (reseeded, same))]
     if np.array_equal(log_pdf[0], log_pdf[1]):
-        return exact([], "densities that differ", f"{CROWD} records reordered: the same bits")
+        return exact([], "densities that differ", f"{REORDERED} records reordered: the same bits")
     by_order, by_seed = (np.abs(other - log_pdf[0]).mean(1)[order != same] for other in log_pdf[1:])
     difference = by_order - by_seed
     unequal = difference[difference != 0]
     p = stats.wilcoxon(unequal, alternative="greater").pvalue if len(unequal) else 1.0
     worst = int(np.flatnonzero(order != same)[difference.argmax()])
-    words = f"{CROWD} records reordered: ln pdf differs by {by_order.mean():.2g}, with another seed by {by_seed.mean():.2g}"
+    words = f"{REORDERED} records reordered: ln pdf differs by {by_order.mean():.2g}, with another seed by {by_seed.mean():.2g}"
     p_values = PValues()
     picture = trials.beside((f"pdf of record {worst}", base, worst), ("in another order", reordered, int(place[worst])))
     p_values.add(p, f"{words}; most in record {worst}", picture)

@@ -1,6 +1,8 @@
 """sample() realises pdf(): it reports that density, and follows it."""
 from __future__ import annotations
 
+import contextlib
+import io
 from typing import Any
 
 import drjit as dr
@@ -11,7 +13,7 @@ from scipy import stats
 from olpm_bench.check.density import ROUNDING, direction
 from olpm_bench.check.particles import vector
 from olpm_bench.check.picture import of_record
-from olpm_bench.check.trained import Trained, as_numpy
+from olpm_bench.check.trained import CORNERS, Trained, as_numpy
 from olpm_bench.check.verdict import Failure, PValues, Verdict, exact
 from representations.square import from_hemisphere, to_hemisphere
 
@@ -22,25 +24,27 @@ LOST = 1e-3                 # share of samples above the horizon whose pdf may b
 
 def report_pdf(trained: Trained) -> Verdict:
     """The density that sample() returns is the one that pdf() gives for its direction; directions have unit length."""
-    d, people = trained.drawn, trained.people
-    alive, found = d.alive, []
-    with np.errstate(invalid="ignore", divide="ignore"):
-        other = alive & ~(np.abs(d.reported / d.pdf - 1) <= ROUNDING)
-    not_finite = ~np.isfinite(d.wo).all(1) | ~np.isfinite(d.reported)
-    not_unit = alive & (np.abs(np.linalg.norm(d.wo, axis=1) - 1) > 1e-5)
-    for wrong, what in ((not_finite, "not finite"), (d.reported < 0, "negative"),
-                        (alive & (d.wo[:, 2] <= 0), "below the horizon"), (not_unit, "not of unit length"),
-                        (other, "another density")):
-        if wrong.any():
-            i = int(np.flatnonzero(wrong)[0])
-            words = (f"{people.name(d.record[i])}: a sample at {direction(d.wo[i])} reports {d.reported[i]:.5g} 1/sr, pdf() says "
-                     f"{d.pdf[i]:.5g}: {what}; {wrong.sum()} of {len(wrong)} samples")
-            found.append(Failure(wrong.sum(), words, of_record(trained, d.record[i], d.wo[i])))
+    records, found = trained.records, []
+    for d, how in ((trained.drawn, ""), (trained.corners, f" {CORNERS}")):
+        alive = d.alive
+        with np.errstate(invalid="ignore", divide="ignore"):
+            other = alive & ~(np.abs(d.reported / d.pdf - 1) <= ROUNDING)
+        not_finite = ~np.isfinite(d.wo).all(1) | ~np.isfinite(d.reported)
+        not_unit = alive & (np.abs(np.linalg.norm(d.wo, axis=1) - 1) > 1e-5)
+        for wrong, what in ((not_finite, "not finite"), (d.reported < 0, "negative"),
+                            (alive & (d.wo[:, 2] <= 0), "below the horizon"), (not_unit, "not of unit length"),
+                            (other, "another density")):
+            if wrong.any():
+                i = int(np.flatnonzero(wrong)[0])
+                words = (f"{records.name(d.record[i])}: a sample{how} at {direction(d.wo[i])} reports {d.reported[i]:.5g} 1/sr, "
+                         f"pdf() says {d.pdf[i]:.5g}: {what}; {wrong.sum()} of {len(wrong)} samples")
+                found.append(Failure(wrong.sum(), words, of_record(trained, d.record[i], d.wo[i])))
+    d, alive = trained.drawn, trained.drawn.alive
     lost = ~alive & (d.wo[:, 2] > 0)
-    share = np.bincount(d.record, lost, len(people)) / people.counts
+    share = np.bincount(d.record, lost, len(records)) / records.counts
     if share.max() > LOST:
         r = int(share.argmax())
-        found.append(Failure(lost.sum(), f"{people.name(r)}: {share[r]:.2%} of the samples fail, but are not below the horizon",
+        found.append(Failure(lost.sum(), f"{records.name(r)}: {share[r]:.2%} of the samples fail, but are not below the horizon",
                              of_record(trained, r)))
     return exact(found, "wrong samples", f"{len(alive)} samples, {1 - alive.mean():.2%} fail, {lost.mean():.1e} by rounding")
 
@@ -55,21 +59,21 @@ def follow_pdf(trained: Trained, level: float) -> Verdict:
     A record's x and y are independent draws, and their numbers are fixed: the variance of a mean of terms t over n of them is
     (E t^2 - (E t)^2) / n.  So it is for the sum over all bins; in the bins E t^2 / n stands for it (see `chi_square`).
     """
-    people, d, p = trained.people, trained.drawn, trained.people.proposed
+    records, d, p = trained.records, trained.drawn, trained.records.proposed
     above = d.alive & (d.wo[:, 2] > 0)
     record, wo, f_x, f_y = d.record[above], d.wo[above], d.pdf[above], trained.proposed
-    q_x = people.proposals.pdf(record, wo)
-    sampled, square_x = _binned(q_x / (q_x + f_x), record, wo, people.counts)
-    expected, square_y = _binned(f_y / (p.q + f_y), p.record, p.wo, people.counts)
+    q_x = records.proposals.pdf(record, wo)
+    sampled, square_x = _binned(q_x / (q_x + f_x), record, wo, records.counts)
+    expected, square_y = _binned(f_y / (p.q + f_y), p.record, p.wo, records.counts)
     square, p_values = square_x + square_y, PValues()
-    variance = square.sum(1) - (sampled.sum(1) ** 2 + expected.sum(1) ** 2) / people.counts
-    for r in range(len(people)):
-        chi2, bins, worst = chi_square(sampled[r], expected[r], square[r], FEWEST / people.counts[r])
+    variance = square.sum(1) - (sampled.sum(1) ** 2 + expected.sum(1) ** 2) / records.counts
+    for r in range(len(records)):
+        chi2, bins, worst = chi_square(sampled[r], expected[r], square[r], FEWEST / records.counts[r])
         wo = _centre(worst)
-        words = f"{people.name(r)}: chi-square {chi2:.0f} for {bins} bins, worst around {direction(wo)}"
+        words = f"{records.name(r)}: chi-square {chi2:.0f} for {bins} bins, worst around {direction(wo)}"
         p_values.add(stats.chi2.sf(chi2, bins), words, of_record(trained, r, wo))
-    for condition in dict.fromkeys(people.conditions):
-        some = [c == condition for c in people.conditions]
+    for condition in dict.fromkeys(records.conditions):
+        some = [c == condition for c in records.conditions]
         p_value, words = of_sums(sampled[some].sum(), expected[some].sum(), variance[some].sum())
         p_values.add(p_value, f"all records '{condition}': {words}", of_record(trained, some.index(True)))
     return p_values.verdict(level, f"{len(q_x) + len(f_y)} directions")
@@ -123,22 +127,31 @@ def _centre(index: int) -> np.ndarray:
 
 
 def mind_active(trained: Trained, n: int = 4096) -> Verdict:
-    """Lanes that are switched off may hold any record; the others don't notice."""
-    rng, people, r = trained.people.rng(7), trained.people, trained.representation
-    records, on = rng.integers(0, len(people), n), rng.random(n) < 0.5
-    active, record = mi.Bool(on), mi.UInt32(records.astype(np.uint32))
-    masked, at = dr.select(active, record, mi.UInt32(0xFFFFFFFF)), trained.at(records)
+    """Lanes that are switched off may ask for records that don't exist: nothing is read there, and other lanes don't notice.
+
+    Such a read may return anything or end the process; `JitFlag.Debug` makes it 0, and a line on sys.stderr.
+    """
+    rng, records, r = trained.records.rng(7), trained.records, trained.representation
+    chosen, on = rng.integers(0, len(records), n), rng.random(n) < 0.5
+    active, record = mi.Bool(on), mi.UInt32(chosen.astype(np.uint32))
+    masked, at = mi.UInt32(np.where(on, chosen, len(records)).astype(np.uint32)), trained.at(chosen)
     u, v = mi.Float(rng.random(n).astype(np.float32)), mi.Point2f(rng.random((2, n)).astype(np.float32))
-    wo, pdf = r.sample(trained.state, masked, u, v, active, at)
     expected, expected_pdf = r.sample(trained.state, record, u, v, True, at)
-    again = r.pdf(trained.state, masked, expected, active, at)
-    found = []
+    dr.eval(expected, expected_pdf)
+    found, said = [], io.StringIO()
+    with contextlib.redirect_stderr(said), dr.scoped_set_flag(dr.JitFlag.Debug):
+        wo, pdf = r.sample(trained.state, masked, u, v, active, at)
+        again = r.pdf(trained.state, masked, expected, active, at)
+        dr.eval(wo, pdf, again)
+        dr.sync_thread()
+    if reads := [line.strip() for line in said.getvalue().splitlines() if "out-of-bounds" in line]:
+        found.append(Failure(len(reads), f"lanes that are switched off read the state: {reads[0]}"))
     for name, a, b in (("the pdf of sample()", pdf, expected_pdf), ("the direction of sample()", wo.z, expected.z),
                        ("pdf()", again, expected_pdf)):
         a, b = as_numpy(a, n), as_numpy(b, n)
         wrong = on & ~np.isclose(a, b, rtol=ROUNDING, equal_nan=True)
         if wrong.any():
             i = int(np.flatnonzero(wrong)[0])
-            words = f"{people.name(records[i])}: {name} is {a[i]:.5g} instead of {b[i]:.5g} where other lanes are switched off"
+            words = f"{records.name(chosen[i])}: {name} is {a[i]:.5g} instead of {b[i]:.5g} where other lanes are switched off"
             found.append(Failure(wrong.sum(), words))
-    return exact(found, "lanes that notice", f"{n} lanes, half of them switched off")
+    return exact(found, "reads, or lanes that notice", f"{n} lanes, half of them switched off")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from olpm_bench.check import crowd, density, kernel, learning, memory, purity, samples, unbiased
+from olpm_bench.check import density, kernel, learning, many_records, memory, purity, samples, unbiased
 from olpm_bench.check.population import population, population_with_parallax
 from olpm_bench.check.trained import Trained
 from olpm_bench.check.verdict import Verdict, combined, sidak
@@ -57,8 +57,9 @@ class Subject:
         return Trained(self.representation, population_with_parallax(self.seed))
 
     @cached_property
-    def trials(self) -> purity.Trials:
-        return purity.Trials(self.representation, self.seed)
+    def trials(self) -> list[purity.Trials]:
+        """Without and with parallax."""
+        return [purity.Trials(self.specification, self.seed, parallax, "grows" in self.declared) for parallax in (False, True)]
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ CHECKS = (
     Check("samples", "samples follow the pdf", lambda s, level: samples.follow_pdf(s.trained, level), statistical=True),
     Check("one-particle", "around a single particle, samples follow the pdf",
           lambda s, level: kernel.keep_balance(s.representation, s.seed, level), statistical=True),
-    Check("inactive-lanes", "lanes that are switched off change nothing", lambda s, _: samples.mind_active(s.trained)),
+    Check("inactive-lanes", "lanes that are switched off read and change nothing", lambda s, _: samples.mind_active(s.trained)),
     Check("parallax-density", "as density, asked from beside the record", lambda s, _: density.is_valid(s.aimed)),
     Check("parallax-integral", "as integral, asked from beside the record",
           lambda s, level: density.integral(s.aimed, level), statistical=True),
@@ -86,17 +87,17 @@ CHECKS = (
     Check("parallax-samples", "as samples, asked from beside the record",
           lambda s, level: samples.follow_pdf(s.aimed, level), statistical=True),
     Check("many-records", "none of ten thousands of records is wrong",
-          lambda s, level: crowd.be_many(s.representation, s.seed, level), statistical=True),
+          lambda s, level: many_records.are_right(s.representation, s.seed, level), statistical=True),
     Check("purity", "same input, same bits; arguments are left alone", lambda s, _: purity.stay_pure(s.trials)),
     Check("independence", "other records, and the order of records, don't matter",
           lambda s, level: purity.be_independent(s.trials, level), statistical=True),
     Check("scale", "the scale of weights doesn't matter", lambda s, _: purity.ignore_scale(s.trials)),
     Check("nothing-new", "no particles, or of no weight, teach nothing", lambda s, _: purity.ignore_nothing(s.trials)),
-    Check("new-records", "appended records begin fresh, learn, and disturb none", lambda s, _: purity.take_new_records(s.trials)),
+    Check("new-records", "states are stored; appended records begin fresh, learn, and disturb none",
+          lambda s, _: purity.take_new_records(s.trials)),
     Check("learning", "held-out directions become more likely with particles",
           lambda s, level: learning.learn(s.representation, s.seed, "constant" in s.declared, level), statistical=True),
-    Check("memory", "bytes a record don't grow with particles",
-          lambda s, _: memory.stay_bounded(s.representation, s.seed, "grows" in s.declared)),
+    Check("memory", "bytes a record don't grow with particles", lambda s, _: memory.stay_bounded(s.trials)),
     Check("furnace", "guided, a closed box keeps its radiance",
           lambda s, level: unbiased.keep_the_furnace(s.specification, s.seed, level), statistical=True),
     Check("image", "guided, an image keeps its expectation",

@@ -1,6 +1,7 @@
 """A representation in many states of training at once: its samples, and its density where it matters."""
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,6 +14,7 @@ from olpm_bench.check.particles import vector
 from olpm_bench.check.population import Directions, Population
 
 ONE = 1 - 2.0**-24                  # the largest float32 below 1
+CORNERS = "by numbers of 0 and 1 - 2^-24"
 
 
 @dataclass(frozen=True)
@@ -37,16 +39,16 @@ def as_numpy(value: Any, n: int) -> np.ndarray:
 class Trained:
     """A state of all records of a population, after all of its batches."""
 
-    def __init__(self, representation: Any, people: Population) -> None:
-        self.representation, self.people = representation, people
-        state = representation.init(len(people), people.seed, people.at is not None)
-        for index, batch in enumerate(people.arrays()):
-            state = representation.update(state, batch, people.seed + index)
+    def __init__(self, representation: Any, records: Population) -> None:
+        self.representation, self.records = representation, records
+        state = representation.init(len(records), records.seed, records.at is not None)
+        for index, batch in enumerate(records.arrays()):
+            state = representation.update(state, batch, records.seed + index)
             dr.eval(state)
         self.state = state
 
     def at(self, record: np.ndarray) -> mi.Vector3f | None:
-        return None if self.people.at is None else vector(self.people.at[record])
+        return None if self.records.at is None else vector(self.records.at[record])
 
     def density(self, record: np.ndarray, wo: np.ndarray) -> np.ndarray:
         """pdf() at directions [n, 3], each of its record."""
@@ -54,10 +56,12 @@ class Trained:
         return as_numpy(pdf, len(wo))
 
     def draw(self, record: np.ndarray, rng: np.random.Generator) -> Samples:
-        """A sample of each record; the first eight of the call have the smallest and largest random numbers."""
-        n = len(record)
-        u = (rng.integers(0, 1 << 24, (3, n)) / (1 << 24)).astype(np.float32)
-        u[:, :8] = np.array([[0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 1, 1, 0, 0, 1, 1], [0, 1, 0, 1, 0, 1, 0, 1]]) * ONE
+        """A sample of each record."""
+        return self._draw(record, rng.integers(0, 1 << 24, (3, len(record))) / (1 << 24))
+
+    def _draw(self, record: np.ndarray, u: np.ndarray) -> Samples:
+        """By the random numbers u [3, n]."""
+        n, u = len(record), u.astype(np.float32)
         wo, pdf = self.representation.sample(self.state, mi.UInt32(record.astype(np.uint32)), mi.Float(u[0]),
                                              mi.Point2f(u[1], u[2]), True, self.at(record))
         dr.eval(wo, pdf)
@@ -69,23 +73,29 @@ class Trained:
     @cached_property
     def drawn(self) -> Samples:
         """Samples of all records, shuffled."""
-        rng = self.people.rng(5)
-        return self.draw(rng.permutation(np.repeat(np.arange(len(self.people)), self.people.counts)), rng)
+        rng = self.records.rng(5)
+        return self.draw(rng.permutation(np.repeat(np.arange(len(self.records)), self.records.counts)), rng)
+
+    @cached_property
+    def corners(self) -> Samples:
+        """Eight samples of every record, by the smallest and largest random numbers."""
+        n = len(self.records)
+        return self._draw(np.repeat(np.arange(n), 8), np.tile(np.array(list(itertools.product((0, ONE), repeat=3))).T, n))
 
     @cached_property
     def proposed(self) -> np.ndarray:
         """pdf() at the population's `proposed`."""
-        return self._at(self.people.proposed)
+        return self._at(self.records.proposed)
 
     @cached_property
     def mesh(self) -> np.ndarray:
         """pdf() at the population's `mesh`."""
-        return self._at(self.people.mesh)
+        return self._at(self.records.mesh)
 
     @cached_property
     def probes(self) -> np.ndarray:
         """pdf() at the population's `probes`."""
-        return self._at(self.people.probes)
+        return self._at(self.records.probes)
 
     def _at(self, directions: Directions) -> np.ndarray:
         return self.density(directions.record, directions.wo)

@@ -68,12 +68,12 @@ def test_proposals_have_their_density() -> None:
 
 
 def test_every_condition_is_in_the_population() -> None:
-    people = population(0)
-    assert set(people.conditions) == set(CONDITIONS)
-    assert max(len(people.of(r)[1]) for r in range(len(people))) > 1_000_000
-    empty = [r for r in range(len(people)) if len(people.of(r)[1]) == 0]
-    assert empty and all(people.conditions[r] in ("untrained", "few at a time") for r in empty)
-    assert all(people.conditions[r] != people.conditions[r + 1] for r in range(len(people) - 1))
+    records = population(0)
+    assert set(records.conditions) == set(CONDITIONS)
+    assert max(len(records.of(r)[1]) for r in range(len(records))) > 1_000_000
+    empty = [r for r in range(len(records)) if len(records.of(r)[1]) == 0]
+    assert empty and all(records.conditions[r] in ("untrained", "few at a time") for r in empty)
+    assert all(records.conditions[r] != records.conditions[r + 1] for r in range(len(records) - 1))
 
 
 def test_the_disk_keeps_areas() -> None:
@@ -102,11 +102,23 @@ def test_a_failure_has_words_a_picture_and_an_exit_code(tmp_path: Path) -> None:
     assert picture.name == "scale.png" and str(picture) in result.stdout.replace("\n", "")
 
 
-@pytest.mark.parametrize(("mutant", "words"), [("UntrainedTwoPercent", "samples and pdf differ by -2"), ("OneNaN", "record ")])
-def test_ten_thousands_of_records_have_a_picture(tmp_path: Path, mutant: str, words: str) -> None:
-    result = call(f"{MUTANTS}:{mutant}", "--only", "many-records", "--pictures", tmp_path)
+@pytest.mark.parametrize(("mutant", "check", "words"), [
+    ("UntrainedTwoPercent", "many-records", "samples and pdf differ by -2"), ("OneNaN", "many-records", "record "),
+    ("SeedIgnored", "purity", "gives other bits")])
+def test_what_fails_has_a_picture(tmp_path: Path, mutant: str, check: str, words: str) -> None:
+    result = call(f"{MUTANTS}:{mutant}", "--only", check, "--pictures", tmp_path)
     picture, = tmp_path.rglob("*.png")
-    assert result.exit_code == 1 and words in result.stdout and picture.name == "many-records.png"
+    assert result.exit_code == 1 and words in result.stdout and picture.name == f"{check}.png"
+
+
+def test_the_picture_of_a_cone_on_its_disk_shows_too_many_samples_in_the_middle() -> None:
+    outcome, = suite.run(suite.Subject({"type": f"{MUTANTS}:DiskForCone"}), suite.named(["one-particle"]))
+    assert outcome.verdict.picture is not None
+    pdf, samples, z = (panel.values for panel in outcome.verdict.picture())
+    middle, radius = slice(14, 18), np.hypot(*np.mgrid[-15.5:16, -15.5:16])
+    rim = (pdf > 0.99 * pdf.max()) & (radius > radius[pdf > 0.99 * pdf.max()].max() - 1)
+    assert z[middle, middle].mean() > 3 and z[rim].mean() < -1
+    assert samples.sum() == pytest.approx(pdf.sum(), rel=0.01)
 
 
 def test_a_declaration_is_believed_only_if_it_is_true() -> None:
@@ -154,9 +166,11 @@ def test_a_campaign_goes_on_from_its_log(tmp_path: Path) -> None:
     mine.write_text(mine.read_text() + "# changed\n")
     seed, total, *_ = campaign("--seed", 9)
     assert seed.startswith("seed 9") and "0 of 1 runs" in total and len(log.read_text().splitlines()) == 5
-    log.write_text(log.read_text() + '{"seed": 1')
-    result = call(f"{mine}:Mine", "--log", log)
-    assert result.exit_code == 2 and "line 6 is broken" in result.stderr
+    good = log.read_bytes()
+    for bad in (b'{"seed": 1', b"PK\x03\x04\xff\xfe", b"[" * 100_000):
+        log.write_bytes(good + bad)
+        result = call(f"{mine}:Mine", "--log", log)
+        assert result.exit_code == 2 and "line 6 is broken" in result.stderr and len(result.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from olpm_bench.check import crowd, population, samples
+from olpm_bench.check import many_records, population, samples
 from olpm_bench.check.particles import equal, lobes, nothing
 from olpm_bench.check.trained import Trained
 from olpm_bench.check.verdict import PValues
@@ -30,7 +30,7 @@ def p_values(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float]]:
     monkeypatch.setattr(samples, "ROUNDING", 0.0)
     monkeypatch.setattr(population, "FEW", 1 << 13)
     monkeypatch.setattr(population, "SAMPLES", 1 << 13)
-    monkeypatch.setattr(crowd, "RECORDS", 1 << 12)
+    monkeypatch.setattr(many_records, "RECORDS", 1 << 12)
     return found
 
 
@@ -46,7 +46,7 @@ def test_p_values_are_uniform_if_nothing_is_wrong(representation, p_values) -> N
     for seed in range(SEEDS):
         samples.follow_pdf(Trained(representation, small_population(seed)), 0.01)
         if seed % 3 == 0:
-            crowd.be_many(representation, seed, 0.01)
+            many_records.are_right(representation, seed, 0.01)
     for kind in ("sum", "lanes", "blocks"):
         assert stats.kstest(p_values[kind], "uniform").pvalue > LEVEL, (kind, np.sort(p_values[kind]))
     assert len(p_values["sum"]) == 4 * SEEDS + SEEDS // 3
@@ -57,5 +57,5 @@ def test_two_percent_are_found_in_few_samples(p_values) -> None:
     """Of 16,384 samples by their sum, and no bin shows it; of 65,536 in many records."""
     samples.follow_pdf(Trained(mutants.UntrainedTwoPercent(), small_population(0)), 0.01)
     assert p_values["sum"][0] < 1e-9 and min(p_values["bins"]) > 1e-3
-    crowd.be_many(mutants.UntrainedTwoPercent(), 0, 0.01)
+    many_records.are_right(mutants.UntrainedTwoPercent(), 0, 0.01)
     assert p_values["sum"][-1] < 1e-4 and min(p_values["bins"]) > 1e-3

@@ -169,6 +169,21 @@ class LanesCounted(CosineLobe):
         return cosine_pdf(wo) * some
 
 
+class ActiveForgotten(JensenHistogram):
+    """Lanes that are switched off read the state all the same."""
+    def pdf(self, state, record, wo, active=True, at=None):
+        return super().pdf(state, record, wo, True, at)
+
+
+class DividesByZero(JensenHistogram):
+    """An infinite direction where a random number is exactly 0 and something has been learnt."""
+    def sample(self, state, record, sample1, sample2, active=True, at=None):
+        wo, pdf = super().sample(state, record, sample1, sample2, active, at)
+        learnt = discrete.total(state.cumulative, self.bins, record, active) > 0
+        wo.x += dr.select(learnt, 1e-30 / sample2.x, 0)
+        return wo, pdf
+
+
 class ParallaxInSamplesOnly(HeyCones):
     """pdf() doesn't mind from where it is asked."""
     def pdf(self, state, record, wo, active=True, at=None):
@@ -230,6 +245,32 @@ class SeedIgnored(HeyCones):
         return super().update(state, batch, int(self.generator.integers(2**32)))
 
 
+class ParallaxInPlace(HeyCones):
+    """Of the state that update() was given, it keeps all but the distances."""
+    def update(self, state, batch, seed=0):
+        new = super().update(state, batch, seed)
+        state.near = new.near
+        return new
+
+
+class ParallaxOfNeighbours(HeyCones):
+    """Distances are those of the next record."""
+    def update(self, state, batch, seed=0):
+        new = super().update(state, batch, seed)
+        n = len(new.near)
+        return replace(new, near=dr.gather(mi.Float, new.near, (dr.arange(mi.UInt32, n) + self.cones) % n)) if n else new
+
+
+class ParallaxGrows(HeyCones):
+    """Keeps all distances."""
+    def update(self, state, batch, seed=0):
+        if len(state.near) == 0:
+            return super().update(state, batch, seed)
+        known = dr.gather(mi.Float, state.near, dr.arange(mi.UInt32, len(state.weight)))
+        new = super().update(replace(state, near=known), batch, seed)
+        return replace(new, near=join(new.near, batch.distance))
+
+
 class ScaleMatters(JensenHistogram):
     """A prior in the unit of the weights."""
     def update(self, state, batch, seed=0):
@@ -274,6 +315,31 @@ class FirstRecordsOnly(JensenHistogram):
         return dr.select(record < dr.opaque(mi.UInt32, self.first), super()._density(state, record, *args), 0)
 
 
+@dataclass
+class Summed(JensenState):
+    total: Any              # of all records
+
+
+class NumberOfAll(JensenHistogram):
+    """The state has a number that belongs to no record."""
+    def init(self, n_records, seed=0, parallax=False):
+        return Summed(**vars(super().init(n_records, seed, parallax)), total=dr.zeros(mi.Float, 1))
+
+    def update(self, state, batch, seed=0):
+        return Summed(**vars(super().update(JensenState(state.mass, state.cumulative), batch, seed)), total=state.total + 1)
+
+
+class NotAField(JensenHistogram):
+    """What is no field of the state is lost when that is stored."""
+    def update(self, state, batch, seed=0):
+        new = replace(super().update(state, batch, seed))
+        new.known = True
+        return new
+
+    def _density(self, state, record, wo, total, active):
+        return super()._density(state, record, wo, total if hasattr(state, "known") else 0 * total, active)
+
+
 class LearnsNothing(JensenHistogram):
     """update() returns what it was given."""
     def update(self, state, batch, seed=0):
@@ -287,6 +353,39 @@ class Unlearns(JensenHistogram):
         blur = dr.repeat(mi.Float(batch.count()) * 1e-4 * dr.block_sum(mass, self.bins), self.bins)
         mass = mass + blur
         return JensenState(mass, discrete.accumulate(mass, self.bins))
+
+
+class FirstBatchOnly(JensenHistogram):
+    """A record that has learnt something learns no more."""
+    def update(self, state, batch, seed=0):
+        new = super().update(state, batch, seed)
+        mass = dr.select(self._of_bins(state) > 0, state.mass, new.mass)
+        return JensenState(mass, discrete.accumulate(mass, self.bins))
+
+    def _of_bins(self, state):
+        """Mass of each bin's record."""
+        return discrete.total(state.cumulative, self.bins, dr.arange(mi.UInt32, len(state.mass)) // self.bins)
+
+
+class LastBatchOnly(FirstBatchOnly):
+    """A record forgets what it knew with each batch that teaches it something."""
+    def update(self, state, batch, seed=0):
+        new = JensenHistogram.update(self, self.init(batch.n_records), batch, seed)
+        mass = dr.select(self._of_bins(new) > 0, new.mass, state.mass)
+        return JensenState(mass, discrete.accumulate(mass, self.bins))
+
+
+class FirstHundredOnly(JensenHistogram):
+    """Of each batch a record learns from its first 100 particles."""
+    def update(self, state, batch, seed=0):
+        rank = dr.arange(mi.UInt32, len(batch)) - dr.gather(mi.UInt32, batch.offset, batch.record)
+        return super().update(state, replace(batch, weight=dr.select(rank < 100, batch.weight, 0)), seed)
+
+
+class WeightsIgnored(JensenHistogram):
+    """A particle is a particle, unless it weighs nothing."""
+    def update(self, state, batch, seed=0):
+        return super().update(state, replace(batch, weight=dr.select(batch.weight > 0, mi.Float(1), 0)), seed)
 
 
 @dataclass
@@ -316,10 +415,14 @@ CAUGHT_BY = {
     HorizonForgotten: "density", OneNaN: "many-records", NegativeAtTheRim: "density",
     DiskForCone: "one-particle", SamplesBelowHorizon: "reported-pdf", NumbersIgnored: "samples", NumbersShared: "samples",
     LastBinLost: "samples", NextBin: "samples", NeighboursPdf: "samples", StaleSamples: "samples", ReportsAnother: "reported-pdf",
-    FailsAboveHorizon: "reported-pdf", LanesCounted: "inactive-lanes", ParallaxInSamplesOnly: "parallax-samples",
+    FailsAboveHorizon: "reported-pdf", DividesByZero: "reported-pdf", LanesCounted: "inactive-lanes",
+    ActiveForgotten: "inactive-lanes", ParallaxInSamplesOnly: "parallax-samples",
     ParallaxBelowTheHorizon: "parallax-density", ParallaxTenPercent: "parallax-integral",
     ParallaxNotReported: "parallax-reported", PdfTenPercentOfTrained: "furnace", OneSideNeverSampled: "image",
-    InPlace: "purity", SeedIgnored: "purity", ScaleMatters: "scale", OrderMatters: "independence",
+    InPlace: "purity", SeedIgnored: "purity", ParallaxInPlace: "purity", ParallaxOfNeighbours: "independence",
+    ParallaxGrows: "memory", NumberOfAll: "new-records", NotAField: "new-records", ScaleMatters: "scale",
+    OrderMatters: "independence",
     NeighboursListen: "independence", NothingIsNews: "nothing-new", FirstRecordsOnly: "new-records", LearnsNothing: "learning",
-    Unlearns: "learning", MemoryGrows: "memory", FailsToRun: "density",
+    Unlearns: "learning", FirstBatchOnly: "learning", LastBatchOnly: "learning", FirstHundredOnly: "learning",
+    WeightsIgnored: "learning", MemoryGrows: "memory", FailsToRun: "density",
 }

@@ -27,7 +27,7 @@ PACKET = 16                 # lanes
 SHOWN = 1 << 17             # samples of a record in the picture of it
 
 
-def be_many(representation: Any, seed: int, level: float) -> Verdict:
+def are_right(representation: Any, seed: int, level: float) -> Verdict:
     """Each record learns a lobe of its own; all samples and densities are looked at, and compared as in `follow_pdf`:
     over bins of the square, over blocks of records, and over the lanes of a packet.
     """
