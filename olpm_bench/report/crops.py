@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import summary
+from olpm_bench.bench import metrics, summary
 from olpm_bench.bench.files import replacing
 from olpm_bench.report import figures, sheet, tonemap
 
@@ -24,6 +24,7 @@ FONT = "STIXGeneral"            # of all figures; comes with Matplotlib
 SIZE = 8.0                      # of text [pt], where there is room
 LINE = 3.4                      # height of a line of text [mm]
 STROKE = 1.2                    # of boxes [pt]
+WHOLE = "whole image:"
 NEW_LINE = r"\\"                 # as figuregen has it
 PAGE = """#set page(width: auto, height: auto, margin: 1mm)
 #set text(font: "{font}")
@@ -84,7 +85,10 @@ def _figuregen() -> Any:
 
 
 def _grids(block: sheet.Block, title: str) -> list[Any]:
-    """The two grids of a scene: the reference with boxes, and the insets, a column for the reference and each method."""
+    """The two grids of a scene: the reference with boxes, and the insets, a column for the reference and each method.
+
+    Under each inset stands its own error, at the foot of a column those of the whole image.
+    """
     figuregen = _figuregen()
     images = {"Reference": block.reference, **block.images}
     whole, insets = figuregen.Grid(1, 1), figuregen.Grid(len(block.crops), len(images))
@@ -93,15 +97,19 @@ def _grids(block: sheet.Block, title: str) -> list[Any]:
         colour = list(bytes.fromhex(sheet.BOXES[row][1:]))
         whole[0, 0].set_marker((x, y), (width, height), colour, linewidth_pt=STROKE)
         for column, image in enumerate(images.values()):
-            insets[row, column].image = _png(image[y:y + height, x:x + width], block.exposure)
+            shown, truth = (pixels[y:y + height, x:x + width] for pixels in (image, block.reference))
+            insets[row, column].image = _png(shown, block.exposure)
             insets[row, column].set_frame(STROKE, colour)
-    errors = [NEW_LINE.join((f"L1 {summary.number(l1)}", f"relMSE {summary.number(relmse)}"))
+            insets[row, column].set_caption(f"L1 {summary.number(metrics.l1(shown, truth))}" if column else "")
+    errors = [NEW_LINE.join((WHOLE, f"L1 {summary.number(l1)}", f"relMSE {summary.number(relmse)}"))
               for l1, relmse in block.errors.values()]
-    noise = "" if block.floor is None else NEW_LINE.join(("noise floor", summary.number(block.floor)))
+    noise = "" if block.floor is None else NEW_LINE.join((WHOLE, "noise floor", summary.number(block.floor)))
+    whole[0, 0].set_caption("")
     for grid, above, below in ((whole, [title], [""]), (insets, list(images), [noise, *errors])):
-        for side, texts, lines in (("north", above, 1), ("south", below, 2)):
+        for side, texts, lines in (("north", above, 1), ("south", below, 3)):
             grid.set_col_titles(side, [text.replace('"', "\N{RIGHT DOUBLE QUOTATION MARK}") for text in texts])
             grid.layout.column_titles[side].size, grid.layout.column_titles[side].offset = lines * LINE, 0.4
+        grid.layout.captions["south"].size, grid.layout.captions["south"].offset = LINE, 0.4
     insets.layout.padding["west"] = 1.0
     return [whole, insets]
 
@@ -129,8 +137,10 @@ def _fit_text(page: Any, row: Sequence[Any]) -> None:
             grid.layout.column_titles["north"].size = 2 * LINE
         wanted = max(0.6 * wanted, widest(word for name in names for word in name.split()))
     below = widest(line for text in errors for line in text.split(NEW_LINE))
-    for side, width in (("north", wanted), ("south", below)):
-        row[1].layout.column_titles[side].fontsize = SIZE * min(1.0, room() / width)
+    layout = row[1].layout
+    for text, width in ((layout.column_titles["north"], wanted), (layout.column_titles["south"], below),
+                        (layout.captions["south"], below)):
+        text.fontsize = SIZE * min(1.0, room() / width)
 
 
 def _quoted(text: str) -> str:

@@ -33,6 +33,7 @@ NEAR_LABEL = 0.8                # curves that end further left, in axes units, a
 PANEL = (2.75, 2.05)            # width, height of a panel's axes [inch]
 COLUMNS = 2                     # panels side by side
 ROW = 0.17                      # height of a row of gains [inch]
+MARK = 6.0                      # height of a row of marks of training [pt]
 
 
 @dataclass(frozen=True)
@@ -207,8 +208,9 @@ def caption(found: Finished, trained: bool = False, faint: bool = False) -> str:
     experiment = found.experiment
     n = len(experiment.seeds)
     seeds = f"Median and 5\N{EN DASH}95 % band of {n} seeds." if n > 1 else "One seed."
-    training = " Triangles mark the end of training." if trained else ""
-    faster = f" {TIMES}: times as fast as {experiment.baseline_name} to an equal error, 90 % interval."
+    training = " Hollow markers below the axis: the end of training." if trained else ""
+    interval = ", 90 % jackknife interval" if n > 2 else ""
+    faster = f" {TIMES}: times as fast as {experiment.baseline_name} to an equal error{interval}."
     near = f" Faint: below {NEAR_FLOOR:g} times the noise of the reference." if faint else ""
     return f"{seeds}{training}{faster if len(experiment.shown) > 1 else ''}{near} {machines(found)}"
 
@@ -224,20 +226,22 @@ def draw(panels: Sequence[Panel], title: str = "", note: str = "") -> Figure:
     Args:
         title: above all panels; note: caption below them.
     """
+    from matplotlib import rcParams
     from matplotlib.figure import Figure
 
     figure = Figure()
     subplots = [figure.add_axes((0, 0, 1, 1), label=str(i)) for i in range(len(panels))]
+    strip = max(_draw_panel(axes, panel) for axes, panel in zip(subplots, panels, strict=True))
     for axes, panel in zip(subplots, panels, strict=True):
-        _draw_panel(axes, panel)
         axes.set_xlabel(panel.abscissa)
+        axes.tick_params(axis="x", pad=rcParams["xtick.major.pad"] + strip)
     columns = min(COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
     numbers = [label.get_text() for axes in subplots for label in axes.get_yticklabels()]
     left = 0.32 + max(text_width(text, 7.5) for text in numbers)
     right = 0.28 + 1.03 * max(text_width(text, size) for panel in panels for text, size in (
         *((method, 8) for method in panel.curves), *((speed_up_label(interval), 6.5) for interval in panel.speed_ups.values())))
-    bottom, top = 0.42, 0.28 if any(panel.title for panel in panels) else 0.1
+    bottom, top = 0.42 + strip / 72, 0.28 if any(panel.title for panel in panels) else 0.1
     width = columns * (left + PANEL[0] + right)
     lines = textwrap.wrap(note, width=int((width - left) * 21))
     head, foot = 0.28 if title else 0.0, 0.06 + 0.115 * len(lines)
@@ -275,7 +279,8 @@ def text_width(text: str, size: float) -> float:
     return float(TextPath((0, 0), text, size=size, prop=FontProperties(family="STIXGeneral")).get_extents().width) / 72
 
 
-def _draw_panel(axes: Axes, panel: Panel) -> None:
+def _draw_panel(axes: Axes, panel: Panel) -> float:
+    """Returns how far below the ticks of the time axis something is drawn [pt]."""
     styles = {method: _look(panel.looks[method]) for method in panel.curves}
     axes.set_title(panel.title)
     axes.set_xscale("log")
@@ -286,8 +291,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     _draw_floor(axes, panel)
     if panel.slope:
         _draw_slope(axes, panel)
-    _draw_training(axes, panel.training, styles)
     _draw_labels(axes, panel, styles)
+    return _draw_training(axes, panel.training, styles)
 
 
 def _limits(axes: Axes, panel: Panel) -> None:
@@ -360,20 +365,10 @@ def _draw_floor(axes: Axes, panel: Panel) -> None:
     if lowest < panel.floor:            # a poor reference: the curves are below its line
         _note(axes, "noise of the reference", (0, panel.floor), (4, 2), ha="left", va="bottom")
     elif panel.floor >= low:
-        _note_at_a_side(axes, "noise of the reference", panel, panel.floor, -2, "right", va="top")
+        _note(axes, "noise of the reference", (1, panel.floor), (-2, -2), ha="right", va="top")
     elif panel.floor > 0:
         text = f"noise of the reference: {tick_label(float(f'{panel.floor:.2g}'))} \N{DOWNWARDS ARROW}"
-        _note_at_a_side(axes, text, panel, low, 2, "left", va="bottom")
-
-
-def _note_at_a_side(axes: Axes, text: str, panel: Panel, y: float, offset: float, wanted: str, va: str) -> None:
-    """A note at the left or right end of the axis, the wanted one unless only the other is clear of the triangles of training."""
-    low, high = np.log(axes.get_xlim())
-    ends = [(math.log(time) - low) / (high - low) for time in panel.training.values()]
-    room = 0.06 + text_width(text, 6.5) / PANEL[0]
-    clear = {"left": all(end > room for end in ends), "right": all(end < 1 - room for end in ends)}
-    side = wanted if clear[wanted] or not any(clear.values()) else "left" if wanted == "right" else "right"
-    _note(axes, text, (0, y) if side == "left" else (1, y), (4 if side == "left" else -2, offset), ha=side, va=va)
+        _note(axes, text, (0, low), (4, 2), ha="left", va="bottom")
 
 
 def _note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **alignment: Any) -> None:
@@ -381,18 +376,28 @@ def _note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, f
                   color=GREY, **alignment)
 
 
-def _draw_training(axes: Axes, training: Mapping[str, float], styles: Mapping[str, Mapping[str, Any]]) -> None:
-    """A triangle on the time axis where each method's training ends; near ones are stacked."""
+def _draw_training(axes: Axes, training: Mapping[str, float], styles: Mapping[str, Mapping[str, Any]]) -> float:
+    """A hollow marker of each method below the time axis, where its training ends; near ones are stacked.
+
+    Returns:
+        How far below the ticks the last row ends [pt].
+    """
+    from matplotlib import rcParams
+    from matplotlib.transforms import ScaledTranslation
+
     low, high = np.log(axes.get_xlim())
     placed: list[tuple[float, int]] = []
     for method, seconds in sorted(training.items(), key=lambda item: item[1]):
         x = (math.log(seconds) - low) / (high - low)
-        level = 0
-        while any(abs(x - other) < 0.03 and level == taken for other, taken in placed):
-            level += 1
-        placed.append((x, level))
-        axes.plot(x, 0.018 + 0.032 * level, marker="^", linestyle="none", markersize=4.5, color=styles[method]["color"],
-                  transform=axes.transAxes, clip_on=False, zorder=5)
+        row = 0
+        while any(abs(x - other) < 0.03 and row == taken for other, taken in placed):
+            row += 1
+        placed.append((x, row))
+        below = ScaledTranslation(0, -(row + 0.7) * MARK / 72, axes.figure.dpi_scale_trans)
+        axes.plot(x, 0, marker=styles[method]["marker"], linestyle="none", markersize=4.2, markerfacecolor="white",
+                  markeredgecolor=styles[method]["color"], markeredgewidth=0.9, transform=axes.transAxes + below,
+                  clip_on=False, zorder=5)
+    return max((MARK * (row + 1) - rcParams["xtick.major.size"] for _, row in placed), default=0)
 
 
 def _draw_labels(axes: Axes, panel: Panel, styles: Mapping[str, Mapping[str, Any]]) -> None:

@@ -103,7 +103,7 @@ def test_no_link_leads_out_of_the_results_folder(experiment, tmp_path):
 
 @pytest.mark.parametrize("arguments, words", [
     (("missing.toml", "--pixel", "1,1"), ["missing.toml", "no such file"]),
-    ((".", "--pixel", "1,1"), ["no experiment.toml", "results folder"]),
+    ((".", "--pixel", "1,1"), ["no experiment.toml", "no folder of results"]),
     (("two.toml", "--pixel", "1,1"), ["which scene? --scene NAME", "door_ajar, cornell_box"]),
     (("two.toml", "--pixel", "1,1", "--scene", "room"), ["no scene 'room'", "known: door_ajar, cornell_box"]),
     (("test.toml", "--pixel", "1"), ["--pixel 1:", "X,Y"]),

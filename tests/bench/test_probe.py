@@ -31,6 +31,7 @@ def test_a_process_that_dies_or_hangs_is_started_again():
 def test_nothing_is_imported_from_the_folder_that_one_works_in(tmp_path, monkeypatch):
     """A downloaded scene may have a json.py beside it."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)         # what it names is wanted, "." too
     (tmp_path / "json.py").write_text("open('was_run', 'w')")
     (tmp_path / "room.xml").write_text("<scene")
     with probe.Process() as process:

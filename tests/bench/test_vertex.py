@@ -9,6 +9,7 @@ from scipy import stats
 from small_scenes import box, camera, furnace, grey, wall
 
 from olpm_bench.bench import vertex
+from olpm_bench.check.verdict import sidak
 from olpm_bench.transport.settings import InputError, IntegratorSettings
 from representations import square
 
@@ -66,7 +67,7 @@ def test_of_a_furnace_is_the_geometric_series_and_the_share_of_emitters():
     expected = vertex.over_bins((local[:, 2] * (a + a**2 + a**3 + w)).reshape(edge, edge), BINS)
     error = found.incident.std(0, ddof=1) / np.sqrt(len(found.incident)) + 0.01 * expected       # and of the quadrature
     z_values = (found.incident.mean(0) - expected) / error
-    level = 1 - (1 - 0.01) ** (1 / len(z_values))
+    level = sidak(0.01, len(z_values))
     assert (2 * stats.t.sf(abs(z_values), 7)).min() > level
     assert 0 < found.noise < 0.2
 

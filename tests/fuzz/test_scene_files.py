@@ -105,7 +105,10 @@ def elements(draw: st.DrawFn, valid: str) -> bytes:
 
 
 def judge(process, folder: Path, xml: bytes, kind: str = "scene") -> str:
-    """The scene read by a process as shields the commands, which may be killed by Mitsuba; returns what came of it."""
+    """The scene read by a process as shields the commands, which may be killed by Mitsuba; returns what came of it.
+
+    What kills a command must already kill that process, which comes before it: the load.
+    """
     def files() -> list[tuple[Path, int]]:
         return sorted((p, p.stat().st_mtime_ns) for p in folder.rglob("*") if "results" not in p.parts)
 
@@ -113,6 +116,7 @@ def judge(process, folder: Path, xml: bytes, kind: str = "scene") -> str:
     before = files()
     answer = process.ask(kind, str(folder / "scene.xml"))
     assert {"ok", "refused", "died"} & answer.keys(), answer
+    assert kind == "scene" or "died" not in answer or "died" in process.ask("scene", str(folder / "scene.xml")), answer
     assert files() == before
     return next(iter(answer))
 

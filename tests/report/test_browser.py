@@ -1,6 +1,10 @@
-"""The page in a browser: it opens from disk, flips, sorts, asks the network for nothing and complains of nothing."""
+"""The page in a browser: it opens from disk, flips, sorts, shows its curves, asks the network for nothing, complains of nothing.
+
+Without a browser it is skipped, but fails where `OLPM_BENCH_NEEDS_BROWSER` is set, as in continuous integration.
+"""
 from __future__ import annotations
 
+import os
 import shutil
 from types import SimpleNamespace
 
@@ -9,13 +13,14 @@ import pytest
 from skimage.io import imread
 
 from olpm_bench.bench import summary
-from olpm_bench.report import page, sheet
+from olpm_bench.report import figures, page, sheet
 
 pytest.importorskip("jinja2", reason="needs the extra report")
 pytest.importorskip("simpleimageio", reason="needs the extra report")
 driver = pytest.importorskip("playwright.sync_api", reason="needs the extra dev")
 
 NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+SECOND = (0, 0x72, 0xB2)                # colour of the second method
 
 
 @pytest.fixture()
@@ -23,8 +28,12 @@ def opened(finished, tmp_path):
     """page, complaints, requests: the report in a browser 1000 pixels wide, once its images are drawn."""
     executable = next(filter(None, map(shutil.which, NAMES)), None)
     if executable is None:
-        pytest.skip(f"needs a browser on the PATH: {', '.join(NAMES)}")
-    page.page(finished, summary.summarise(finished)["rows"], sheet.blocks(finished), [])
+        missing = pytest.fail if "OLPM_BENCH_NEEDS_BROWSER" in os.environ else pytest.skip
+        missing(f"needs a browser on the PATH: {', '.join(NAMES)}")
+    rows = summary.summarise(finished)["rows"]
+    figures.curves(finished)
+    figures.gains(finished, rows)
+    page.page(finished, rows, sheet.blocks(finished), ["figure", "gains"])
     complaints, requests = [], []
     with driver.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])      # root needs that
@@ -73,6 +82,11 @@ def test_it_opens_flips_and_sorts_without_a_network_and_without_complaint(opened
     for width in (1000, 1600):
         tab.set_viewport_size({"width": width, "height": 1000})
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
+        for name in ("figure", "gains"):
+            tab.locator(f"#{name} svg").screenshot(path=tmp_path / "seen.png")
+            picture = imread(tmp_path / "seen.png")[..., :3].astype(int)
+            drawn = np.abs(picture - SECOND).max(-1) < 30           # curve, dot, interval and name of the second method
+            assert picture.shape[1] > 300 and 100 < drawn.sum() < 0.1 * drawn.size
     assert opened.complaints == []
     assert {request.partition(":")[0] for request in opened.requests} <= {"file", "data"}
     assert sum(request.startswith("file:") for request in opened.requests) == 1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from skimage.io import imread
 
+from olpm_bench.bench import summary
 from olpm_bench.report import crops, sheet, tonemap
 
 if importlib.util.find_spec("figuregen") is None:         # not imported here: it would change the style of all plots
@@ -52,6 +53,20 @@ def test_insets_show_the_pixels_of_the_crop(tmp_path):
             seen = picture[round(top + (rows[-1] - top) * (0.25 + 0.5 * y)), round(left + (right[0] - left) * (0.25 + 0.5 * x))]
             expected = tonemap.srgb(shown.images["A"], shown.exposure)[6 + y, 4 + x].astype(int)
             assert np.abs(seen - expected).max() <= 2
+
+
+def test_the_number_under_an_inset_is_the_error_of_what_it_shows():
+    """And those at the foot of a column are of the whole image, and say so."""
+    shown = block()
+    _, insets = crops._grids(shown, "")
+    for row, (x, y, width, height) in enumerate(BOXES):
+        captions = [insets[row, column].elem["captions"]["south"] for column in range(3)]
+        errors = [np.abs(image - shown.reference)[y:y + height, x:x + width].mean() for image in shown.images.values()]
+        assert captions == ["", *(f"L1 {summary.number(error)}" for error in errors)]
+    noise, *whole = insets.data["column_titles"]["south"]["content"]
+    assert noise == r"whole image:\\noise floor\\0.00100"
+    assert whole == [rf"whole image:\\L1 {summary.number(l1)}\\relMSE {summary.number(relmse)}"
+                     for l1, relmse in shown.errors.values()]
 
 
 def test_awkward_names_scenes_and_notes_are_set(tmp_path):

@@ -1,4 +1,4 @@
-"""A representation's density and samples, for NumPy."""
+"""A representation's density and samples, for NumPy; and which checks take long."""
 from __future__ import annotations
 
 from typing import Any
@@ -9,6 +9,8 @@ import numpy as np
 
 from olpm_bench.check.particles import vector
 from representations.state import to_numpy
+
+RENDERS = ("furnace", "image")          # checks that are slow
 
 
 def density(representation: Any, state: Any, record: int, wo: np.ndarray) -> np.ndarray:

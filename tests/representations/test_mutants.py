@@ -5,6 +5,7 @@ from pathlib import Path
 
 import mutants
 import pytest
+from asking import RENDERS
 
 from olpm_bench.check import suite
 
@@ -13,9 +14,6 @@ def outcome(mutant: type, check: str) -> suite.Outcome:
     subject = suite.Subject({"type": f"{Path(mutants.__file__)}:{mutant.__name__}"})
     found, = suite.run(subject, suite.named([check]))
     return found
-
-
-RENDERS = ("furnace", "image")          # slow ones
 
 
 def test_every_check_rejects_something() -> None:

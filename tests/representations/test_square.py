@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from olpm_bench.check.particles import uniform_directions, vector
+from olpm_bench.check.verdict import sidak
 from representations.square import TO_SOLID_ANGLE, from_hemisphere, to_hemisphere
 
 
@@ -39,7 +40,7 @@ def test_jacobian_is_constant() -> None:
 
 def test_uniform_square_is_uniform_hemisphere() -> None:
     wo = to_hemisphere(mi.Point2f(np.random.default_rng(2).random((2, 100_000)).astype(np.float32)))
-    level = 1 - (1 - 1e-3) ** (1 / 2)
+    level = sidak(1e-3, 2)
     assert stats.kstest(np.array(wo.z), "uniform").pvalue > level
     assert stats.kstest(np.arctan2(wo.y, wo.x) / (2 * np.pi) + 0.5, "uniform").pvalue > level
 

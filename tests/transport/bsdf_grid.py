@@ -76,19 +76,21 @@ def _sky() -> mi.Bitmap:
     return mi.Bitmap(np.random.default_rng(5).random((8, 16, 3)).astype(np.float32) ** 4)
 
 
+# Those that shine together are as bright as one another in the image, so that none hides another's error.
 # The sun of `sunsky` is as wide as a fist at arm's length, or else what glass makes of it is too rare for any test.
 EMITTERS = {
     "area": lambda: _panel({"type": "rgb", "value": 5.0}),
     "textured area": lambda: _panel(_texture(seed=7, mean=5, spread=4.9)),
     "directionalarea": lambda: _panel({"type": "rgb", "value": 1.0}, "directionalarea"),
     "point": lambda: {"type": "point", "position": [0.3, -1.2, 0.6], "intensity": 1.0},
-    "spot": lambda: {"type": "spot", "intensity": 5.0, "cutoff_angle": 50.0, "to_world": _looking((0.3, -1.6, 0.6), (0, 0, 0))},
-    "projector": lambda: {"type": "projector", "irradiance": _texture(seed=8), "fov": 60.0, "scale": 5.0,
+    "spot": lambda: {"type": "spot", "intensity": 2.3, "cutoff_angle": 50.0, "to_world": _looking((0.3, -1.6, 0.6), (0, 0, 0))},
+    "projector": lambda: {"type": "projector", "irradiance": _texture(seed=8), "fov": 60.0, "scale": 1.5,
                           "to_world": _looking((0.3, -1.6, 0.6), (0, 0, 0))},
-    "directional": lambda: {"type": "directional", "direction": [0.2, 0.6, -1.0], "irradiance": 2.0},
+    "directional": lambda: {"type": "directional", "direction": [0.2, 0.6, -1.0], "irradiance": 1.0},
     "constant": lambda: {"type": "constant", "radiance": 1.0},
     "envmap": lambda: {"type": "envmap", "bitmap": _sky(), "to_world": mi.ScalarTransform4f().rotate((1, 0, 0), 50)},
-    "sunsky": lambda: {"type": "sunsky", "sun_direction": [0.2, -0.6, 0.8], "sun_aperture": 10.0, "sun_scale": 0.02},
+    "sunsky": lambda: {"type": "sunsky", "sun_direction": [0.2, -0.6, 0.8], "sun_aperture": 10.0, "sun_scale": 0.1,
+                       "sky_scale": 5.0},
 }
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import stats
 
 from olpm_bench.check.small_scenes import RESOLUTION, blocks, box, camera, furnace, grey, lamp, passes, wall
+from olpm_bench.check.verdict import sidak
 
 __all__ = ["RESOLUTION", "assert_no_kernel_a_pass", "assert_same_expectation", "box", "camera", "furnace", "grey", "lamp",
            "passes", "wall"]
@@ -28,7 +29,7 @@ def assert_same_expectation(a: np.ndarray, b: np.ndarray, level: float = 0.01, s
     np.testing.assert_allclose(x[:, flat].mean(0), y[:, flat].mean(0), rtol=1e-4)
     p = stats.ttest_ind(x[:, ~flat], y[:, ~flat], equal_var=False).pvalue
     p = np.append(p, stats.ttest_ind(x.mean(1), y.mean(1), equal_var=False).pvalue)
-    threshold = 1 - (1 - level) ** (1 / len(p))
+    threshold = sidak(level, len(p))
     worst = int(np.argmin(p))
     assert p.min() >= threshold, (f"p = {p.min():.2e} < {threshold:.2e} at {worst} of {len(p)}; "
                                   f"means {a.mean():.5f} and {b.mean():.5f}")

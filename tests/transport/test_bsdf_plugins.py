@@ -9,12 +9,13 @@ from bsdf_grid import BSDFS
 from scipy import stats
 
 from olpm_bench.check.samples import chi_square
+from olpm_bench.check.verdict import sidak
 
 N = 400_000
 BINS = 16                   # along both cos(theta) and phi
 FEWEST = 50.0               # samples of a bin; bins with fewer are pooled
 ANGLES = (0.3, 1.2, np.pi - 0.8)        # of incidence, the last from below
-LEVEL = 1 - (1 - 0.01) ** (1 / (len(BSDFS) * len(ANGLES)))         # Sidak
+LEVEL = sidak(0.01, len(BSDFS) * len(ANGLES))
 
 # Those of Mitsuba 3.9.1 whose densities are not realised where the BSDF has no value: below the horizon or on the dark side pdf()
 # is not 0, or samples of weight 0 report a density.  No image depends on it.

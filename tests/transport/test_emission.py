@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 from small_scenes import assert_no_kernel_a_pass, box, grey, lamp, wall
 
+from olpm_bench.check.verdict import sidak
 from olpm_bench.transport import emission
 from olpm_bench.transport.emission import EmissionGuide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
@@ -87,7 +88,7 @@ def assert_same_mean(a: np.ndarray, b: np.ndarray, tests: int, level: float = 0.
     assert np.isfinite(a).all() and np.isfinite(b).all()
     error = (a.var(dtype=float) / len(a) + b.var(dtype=float) / len(b) + (1e-5 * b.mean()) ** 2) ** 0.5
     p = 2 * stats.norm.sf(abs(a.mean(dtype=float) - b.mean(dtype=float)) / error)
-    assert p > 1 - (1 - level) ** (1 / tests), f"p = {p:.2g}: means {a.mean():.5g} and {b.mean():.5g}"
+    assert p > sidak(level, tests), f"p = {p:.2g}: means {a.mean():.5g} and {b.mean():.5g}"
 
 
 @pytest.mark.parametrize("name", LIGHTS)

@@ -2,8 +2,8 @@
 
 Benedikt Bitterli's scenes come with images by his Tungsten.  They are in the same linear RGB, without tone mapping, and of paths
 of the depth that the scene's file gives.  But materials are not all the same (rough metal, glossy plastic), and nobody tells the
-images' noise: we expect means within 3 %, and half of the blocks of pixels within 5 %.  Found: 1.0 % and 2.6 % (Veach Ajar),
-1.6 % and 1.9 % (Veach Bidir), and blocks of metal and glass that are off by up to 27 %.
+images' noise: we expect means within 3 %, half of the blocks of pixels within 5 %, 95 of 100 within 15 %.  Found: 1.0 %, 2.8 %,
+11 % (Veach Ajar), 1.6 %, 2.3 % and 6 % (Veach Bidir), and single blocks of metal and glass that are off by up to 27 %.
 """
 from __future__ import annotations
 
@@ -42,4 +42,5 @@ def test_unguided_guided_and_foreign_images_agree(name: str):
     h, w, _ = theirs.shape
     theirs = theirs.mean(-1).reshape(rows, h // rows, columns, w // columns).mean((1, 3)).ravel()
     assert abs(ours.mean() / theirs.mean() - 1) < 0.03, (ours.mean(), theirs.mean())
-    assert np.median(abs(ours / theirs - 1)) < 0.05
+    off = abs(ours / theirs - 1)
+    assert np.median(off) < 0.05 and np.quantile(off, 0.95) < 0.15, np.quantile(off, (0.5, 0.95, 1))

@@ -1,9 +1,11 @@
 """Unbiased whatever scatters and whatever shines: every BSDF under every emitter, unguided and guided by each representation.
 
 Each BSDF has a block of pixels, which Welch's t-test compares with Mitsuba's `path`: the block's mean, and those of its quarters.
-A scene has one environment: by default `sunsky` and all local emitters shine at once, and `constant` and `envmap` alone, on a few
-BSDFs.  `pytest -m slow tests/transport/test_grid.py --grid` lets each emitter shine alone on all BSDFs, with four times the
-samples; `-rP` prints which bias would have been seen (README, "What is checked").
+A scene has one environment: by default `sunsky` and all local emitters shine at once, alike in brightness, and `constant` and
+`envmap` alone, on a few BSDFs.  `pytest -m slow tests/transport/test_grid.py --grid` lets each emitter shine alone on all BSDFs,
+with four times the samples; `-rP` prints which bias would have been seen (README, "What is checked").
+
+Camera paths do not see a `directionalarea`, neither in Mitsuba's `path` nor in ours: its photons teach, and it must add nothing.
 """
 from __future__ import annotations
 
@@ -21,6 +23,7 @@ from small_scenes import blocks, passes
 
 import olpm_bench
 import representations
+from olpm_bench.check.verdict import sidak
 from olpm_bench.transport.guide import GuidedPoint
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
 
@@ -42,7 +45,7 @@ FEW = ("diffuse", "conductor", "roughconductor", "dielectric", "plastic", "mask"
 TOGETHER = Room(tuple(name for name in EMITTERS if name not in ("constant", "envmap")))
 MOST = tuple(method for method in METHODS if method != "gaussian_mixture")     # which test_path.py has under each emitter
 ROOMS = {"constant": Room(("constant",), FEW, MOST), "envmap": Room(("envmap",), FEW, MOST), "the others": TOGETHER}
-ALONE = {name: Room((name,)) for name in EMITTERS}
+ALONE = {name: Room((name,)) for name in EMITTERS if name != "directionalarea"}
 
 
 def number_of_tests(rooms: Iterable[Room]) -> int:
@@ -82,7 +85,7 @@ class Comparison:
     """
 
     def __init__(self, ours: Blocks, theirs: Blocks, tests: int) -> None:
-        self.level = 1 - (1 - LEVEL) ** (1 / tests)
+        self.level = sidak(LEVEL, tests)
         self.bsdfs = ours.bsdfs
         whole = stats.ttest_ind(ours.whole, theirs.whole, equal_var=False)
         quarters = stats.ttest_ind(ours.quarters, theirs.quarters, equal_var=False)
@@ -125,6 +128,18 @@ def compare(room: Room, method: str, tests: int, spp: int) -> Comparison:
     guide = trained(room, method) if method != "unguided" else None
     integrator = olpm_bench.integrator(guide, max_depth=DEPTH)
     return Comparison(Blocks(passes(lit(room), integrator, PASSES, spp), room.bsdfs), by_mitsuba(room, spp), tests)
+
+
+def test_emitters_that_shine_together_have_comparable_shares():
+    """Of the light on diffuse spheres: from half to twice an equal share in the image, and a fifth of it at least on each."""
+    by_path = mi.load_dict({"type": "path", "max_depth": DEPTH})
+    light = {name: Blocks(passes(scene((name,), ("diffuse",) * len(BSDFS)), by_path, 1, SPP), tuple(BSDFS)).whole[0]
+             for name in TOGETHER.emitters}
+    assert not light.pop("directionalarea").any()
+    mean = sum(light.values()) / len(light)
+    for name, found in light.items():
+        assert 0.5 < found.mean() / mean.mean() < 2, name
+        assert (found / mean).min() > 0.2, name
 
 
 def test_every_bsdf_under_every_emitter(room, method, request):

@@ -9,6 +9,7 @@ from small_scenes import assert_same_expectation, box, grey, lamp, passes
 
 import olpm_bench
 import representations
+from olpm_bench.check.verdict import sidak
 from olpm_bench.transport import settings
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.gather import GATHERS
@@ -39,7 +40,7 @@ def test_images_are_unbiased(scene, unguided, name):
     guide = train(scene, name, WIDE, PATHS)
     assert guide.parallax and guide.trained > 0.5
     guided = passes(scene, olpm_bench.integrator(guide, max_depth=DEPTH))
-    assert_same_expectation(guided, unguided, level=1 - (1 - 0.01) ** (1 / len(representations.names())))
+    assert_same_expectation(guided, unguided, level=sidak(0.01, len(representations.names())))
 
 
 def test_guides_keep_it(scene, tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_scenes import box, furnace, grey, lamp
 
-from olpm_bench.transport.particles import emit_importons, emit_photons, trace
+from olpm_bench.transport.particles import Particles, emit_importons, emit_photons, trace
 from olpm_bench.transport.settings import IntegratorSettings, TrainingSettings
 from olpm_bench.transport.training import Training
 
@@ -118,3 +118,11 @@ def test_a_lamp_that_nothing_reaches_leaves_no_particles():
     scene = mi.load_dict(box(grey(0.0), lamp=lamp()))
     _, particles = _photons(scene, 6)
     assert len(particles) == 0
+
+
+def test_particles_by_region():
+    """All hits count, and weights that are equal are all effective."""
+    p = np.zeros((6, 4), np.float32)
+    p[:, 0], p[:, 3] = [-1, -1, 1, 1, 1, 1], [1, 1, 1, 1, 1, 0]
+    hits = Particles(mi.Float(p.ravel()), mi.Float(p.ravel()), mi.Float(p.ravel()), dr.arange(mi.UInt32, 6), 6)
+    np.testing.assert_allclose(hits.by_region(lambda p: (p[:, 0] > 0).astype(int), 2), [[2, 2], [4, 3]])
