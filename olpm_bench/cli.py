@@ -22,6 +22,7 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 ENDING = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]      # as Ctrl-C
 RESUMED = ("run", "submit", "gate", "reference")
 LONGEST = 1000              # characters of a complaint
+MAX_SEED = 2**15 - 1        # of cells: `config.MAX_SEED`, whose import would take a second of every --help
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
                   help="Which learnt directional distribution guides a path tracer best?")
@@ -337,8 +338,8 @@ def inspect(run: Annotated[Path, typer.Argument(metavar="RUN", help="An experime
                                                      show_default=False)],
             scene: Annotated[str | None, typer.Option(metavar="NAME[=PATH]", help="Which scene, and where its file is.",
                                                       show_default=False)] = None,
-            seed: Annotated[int | None, typer.Option(min=0, max=2**15 - 1, show_default=False,
-                                                     help="Of the training; the experiment's first by default.")] = None,
+            seed: Annotated[int | None, typer.Option(min=0, max=MAX_SEED, show_default=False, help="Of the training; the "
+                                                     "experiment's first by default.")] = None,
             vertex: Annotated[int | None, typer.Option(min=1, help="Of a path from that pixel; the first that is not specular by "
                                                        "default.", show_default=False)] = None,
             path_seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of that path.")] = 0,

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -106,12 +106,20 @@ class Finished:
 
     @cached_property
     def machines(self) -> list[str]:
-        """The machines that the cells were made on, "CPU, n threads" (and the variant, if that is none for a CPU); where no cell
-        says so, that of the last run."""
+        """The machines that the cells were made on; where no cell says so, that of the last run."""
         cells = [cell for scene in self.scenes for group in scene.cells.values() for cell in group]
         said = [cell.info["machine"] for cell in cells if "machine" in cell.info] or [read_json(self.results.folder / "env.json")]
-        return sorted({", ".join([m["cpu"], *([f"{m['threads']} threads"] if "threads" in m else []),
-                                  *([m["variant"]] if not m.get("variant", "llvm").startswith("llvm") else [])]) for m in said})
+        return sorted({_label(machine) for machine in said})
+
+
+def _label(machine: Mapping[str, Any]) -> str:
+    """"CPU, n threads", and the variant if that is none for a CPU; older cells say less."""
+    label = machine["cpu"]
+    if "threads" in machine:
+        label += f", {machine['threads']} threads"
+    if not machine.get("variant", "llvm").startswith("llvm"):
+        label += f", {machine['variant']}"
+    return str(label)
 
 
 def read(experiment: Experiment, results: Results, references: Mapping[str, Reference], any_version: bool = False) -> Finished:

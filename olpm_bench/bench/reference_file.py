@@ -58,9 +58,9 @@ def read_reference(path: Path, width: int, height: int) -> Reference:
         ResultError: missing, broken, newer, or of another size.
     """
     if path.is_file():
-        parts, _ = read_exr(path)
+        parts, header = read_exr(path)
         if "a.mean" in parts:           # one of ours, by the name of its file
-            return read_reference(path.parent, width, height)
+            return _of_halves(parts, header, path, width, height)
         image = next(iter(parts.values()))
         if image.shape[2] != 3:
             raise ResultError(f"reference {path} has no RGB image")
@@ -76,11 +76,14 @@ def read_reference(path: Path, width: int, height: int) -> Reference:
         raise
     except ResultError as error:
         raise ResultError(f"{error}; remove the folder and make it again") from None
-    meta |= header          # of the same moment as the pixels, should the two files differ
+    # The header is of the same moment as the pixels, should the two files differ
+    return _of_halves(parts, meta | header, path / "reference.exr", width, height)
+
+
+def _of_halves(parts: dict[str, np.ndarray], meta: dict[str, Any], path: Path, width: int, height: int) -> Reference:
     for name in ("a.mean", "b.mean", "a.variance", "b.variance"):
         if name not in parts or not np.isfinite(parts[name]).all():
-            raise ResultError(f"{path / 'reference.exr'} is broken: no finite part '{name}'; "
-                              "remove the folder and make it again")
+            raise ResultError(f"{path} is broken: no finite part '{name}'; remove the folder and make it again")
     averaged = parts["a.mean"].shape[1] // width                # pixels that become one, along a side
     images = [_shrink(parts[name], width, height, path) for name in ("a.mean", "b.mean", "a.variance", "b.variance")]
     return Reference(images[0], images[1], images[2] / averaged ** 2, images[3] / averaged ** 2, meta)

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from olpm_bench import cli
+from olpm_bench.bench import config
 from olpm_bench.bench.exr import read_exr
 from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.cli import app
@@ -77,6 +79,10 @@ def test_help_loads_nothing_heavy():
     code = f"import sys, olpm_bench.cli; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_largest_seed_is_that_of_experiments():
+    assert cli.MAX_SEED == config.MAX_SEED
 
 
 def test_help_names_every_command():

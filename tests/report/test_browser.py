@@ -1,6 +1,6 @@
 """The page in a browser: it opens from disk, flips, sorts, shows its curves, asks the network for nothing, complains of nothing.
 
-Without a browser it is skipped, but fails where `OLPM_BENCH_NEEDS_BROWSER` is set, as in continuous integration where there is one.
+Without a browser it is skipped, but fails where `OLPM_BENCH_NEEDS_BROWSER` is set, as continuous integration does that has one.
 """
 from __future__ import annotations
 

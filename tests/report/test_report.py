@@ -52,11 +52,13 @@ def test_captions_name_the_machines_that_made_the_cells(reported, monkeypatch, c
         monkeypatch.setattr(figures, name, lambda *arguments: notes.append(arguments[-1]))
     monkeypatch.setattr(sheet, "sheet", lambda found, blocks: notes.append(sheet.caption(found)) or [])
     monkeypatch.setattr(sweeps, "sweeps", lambda found: notes.append(sweeps._caption(found)) or [])
-    for seed, machine in enumerate(({"cpu": "Abacus 3", "threads": 2}, {"cpu": "Abacus 1", "threads": 4})):
+    machines = ({"cpu": "Abacus 3", "threads": 2, "variant": "llvm_ad_rgb"},
+                {"cpu": "Abacus 1", "threads": 4, "variant": "cuda_ad_rgb"})
+    for seed, machine in enumerate(machines):
         for path in (folder / "cells").glob(f"*/*/{seed}/cell.json"):
             path.write_text(json.dumps({**json.loads(path.read_text()), "machine": machine, "digests": {}}))
     reported()
-    said = "Abacus 1, 4 threads; Abacus 3, 2 threads"
+    said = "Abacus 1, 4 threads, cuda_ad_rgb; Abacus 3, 2 threads"
     assert len(notes) == 4 and all(note.endswith(f" {said}.") for note in notes)
     assert f"made on different machines, whose seconds do not compare: {said}\n" in capsys.readouterr().out
     if (folder / "report.html").exists():                       # with the extra report
