@@ -49,14 +49,14 @@ def integral(trained: Trained, level: float) -> Verdict:
         picture = of_record(trained, shown)
         words = f"{name}: the pdf integrates to {value:.4f} +- {error:.4f}"
         p_values.add(stats.norm.sf((value - 1 - ROUNDING) / max(error, 1e-12)), f"{words}, more than 1", picture)
-        if records.proposals.complete[some].all():       # else the quadrature may miss narrow lobes
+        if records.complete[some].all():         # else the quadrature may miss narrow lobes
             difference = max(abs(value - sampled) - ROUNDING, 0)
             p_values.add(2 * stats.norm.sf(difference / max(np.hypot(error, sampled_error), 1e-12)),
                          f"{words}, but {sampled:.4f} +- {sampled_error:.4f} of the samples don't fail", picture)
 
     for record in range(n):
         add(records.name(record), [record], record)
-    complete = np.flatnonzero(records.proposals.complete).tolist()
+    complete = np.flatnonzero(records.complete).tolist()
     add("all records", complete, max(complete, key=lambda r: abs(first[r] - alive[r])))
     note = f"{first.mean():.4f} +- {np.sqrt(variance.sum()) / n:.4f} by quadrature; {alive.mean():.4f} of the samples don't fail"
     return p_values.verdict(level, note)

@@ -18,6 +18,7 @@ from olpm_bench.check.suite import LEVEL, Check, Outcome, Subject
 from olpm_bench.report import verdicts
 
 COARSE = (0.1, 0.01)        # levels at which a campaign of some runs can see whether p-values are honest
+CHANCE = 1e-3               # that honest ones are taken for dishonest, in a campaign
 
 
 def examine(subject: Subject, checks: Sequence[Check], folder: Path, quiet: bool = False) -> dict[str, Any]:
@@ -45,7 +46,9 @@ def examine(subject: Subject, checks: Sequence[Check], folder: Path, quiet: bool
 
 def campaign(subject: Subject, checks: Sequence[Check], runs: int, folder: Path, quiet: bool = False,
              log: Path | None = None) -> dict[str, Any]:
-    """Run the checks with `runs` seeds from the subject's on, and count the alarms; other arguments are those of `examine`.
+    """Run the checks with `runs` seeds from the subject's on, count the alarms, and see whether p-values are honest.
+
+    Other arguments are those of `examine`.
 
     log: a file of a JSON line a run.  Seeds that are in it are not run again; all its runs of these checks by this code count.
     """
@@ -74,14 +77,35 @@ def campaign(subject: Subject, checks: Sequence[Check], runs: int, folder: Path,
     found = _logged(log, about) or found            # other processes write to it, too
     lines, n = [found[seed] for seed in sorted(found)], len(found)
     alarms = sum(not line["passed"] for line in lines)
-    beyond = {level: sum(line["p"] < level for line in lines) for level in COARSE}
+    shares = calibration(lines)
     if not quiet:
         verdicts.line(console, f"{subject.name}: {alarms} of {n} runs raised an alarm; at most {n * LEVEL:.2g} expected")
-        for level, count in beyond.items():
-            verdicts.line(console, f"  p < {level}: {count} of {n}, at most {n * level:.3g} expected (binomial p = "
-                          f"{stats.binomtest(count, n, level, 'greater').pvalue:.2g})")
-    return {"representation": subject.specification, "declared": list(subject.declared), "passed": alarms == 0, "level": LEVEL,
-            "alarms": alarms, "below": {str(level): count for level, count in beyond.items()}, "runs": lines}
+        for name, share in shares.items():
+            below = " and ".join(f"p < {level} in {count / share['runs']:.1%}" for level, count in share["below"].items())
+            wrong = "" if share["passed"] else f": FAILED, too small too often (binomial p = {share['binomial_p']:.1g})"
+            verdicts.line(console, f"  {name}: {below} of {share['runs']} runs{wrong}", "bold red" if wrong else "")
+    passed = alarms == 0 and all(share["passed"] for share in shares.values())
+    return {"representation": subject.specification, "declared": list(subject.declared), "passed": passed, "level": LEVEL,
+            "alarms": alarms, "calibration": shares, "runs": lines}
+
+
+def calibration(lines: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """How often the p-values of whole runs, and of each check, lie below `COARSE`; passed unless that is more often than stated.
+
+    They may do so less often: corrections for the number of tests are bounds.  A run in which a check leaves nothing to chance
+    does not count for it.
+    """
+    values = {"all checks": [line["p"] for line in lines]}
+    for line in lines:
+        for name, p in line["smallest"].items():
+            values.setdefault(name, []).append(p)
+    found: dict[str, dict[str, Any]] = {}
+    for name, p_values in values.items():
+        below = {level: sum(p < level for p in p_values) for level in COARSE}
+        p = min(float(stats.binomtest(count, len(p_values), level, "greater").pvalue) for level, count in below.items())
+        found[name] = {"runs": len(p_values), "below": {str(level): count for level, count in below.items()}, "binomial_p": p,
+                       "passed": p >= CHANCE / len(values) / len(COARSE)}
+    return found
 
 
 def _about(subject: Subject, checks: Sequence[Check]) -> dict[str, Any]:
@@ -103,8 +127,9 @@ def _logged(log: Path | None, about: dict[str, Any]) -> dict[int, dict[str, Any]
         try:
             run = json.loads(line)
             if all(run[key] == value for key, value in about.items()):
-                found[int(run["seed"])] = {**run, "passed": bool(run["passed"]), "p": float(run["p"])}
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+                found[int(run["seed"])] = {**run, "passed": bool(run["passed"]), "p": float(run["p"]),
+                                           "smallest": {name: float(p) for name, p in run["smallest"].items()}}
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             raise ResultError(f"{log}: line {number} is broken; remove it") from None
     return found
 

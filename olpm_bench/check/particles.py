@@ -90,12 +90,14 @@ CONDITIONS: dict[str, Condition] = {
 def landing(wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where on a disk of radius 0.1 around the record each particle has landed [n, 3], and its distance [n], some infinite.
 
-    The same for the same directions.
+    The same for the same directions; particles of one direction are identical, and land on one place.
     """
     rng = np.random.default_rng([11, zlib.crc32(wo.tobytes())])
-    phi, r = 2 * np.pi * rng.random(len(wo)), 0.1 * np.sqrt(rng.random(len(wo)))
-    distance = np.where(rng.random(len(wo)) < 0.8, 10 ** rng.uniform(-1.5, 1.5, len(wo)), np.inf)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), 0.01 * rng.normal(size=len(wo))], -1), distance
+    n = min(len(wo), 1) if (wo == wo[:1]).all() else len(wo)
+    phi, r = 2 * np.pi * rng.random(n), 0.1 * np.sqrt(rng.random(n))
+    distance = np.where(rng.random(n) < 0.8, 10 ** rng.uniform(-1.5, 1.5, n), np.inf)
+    place = np.stack([r * np.cos(phi), r * np.sin(phi), 0.01 * rng.normal(size=n)], -1)
+    return np.broadcast_to(place, (len(wo), 3)), np.broadcast_to(distance, len(wo))
 
 
 def batch(particles: list[Particles], parallax: bool = False) -> ParticleBatch:

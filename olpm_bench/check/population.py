@@ -15,7 +15,6 @@ from olpm_bench.check.particles import (
     Particles,
     batch,
     landing,
-    many,
     normalised,
     nothing,
     uniform_directions,
@@ -26,7 +25,8 @@ from representations.interface import ParticleBatch
 from representations.parallax import aim, inverse
 
 COPIES = 3                          # records in each condition, with particles of their own
-FEW, SAMPLES = 1 << 18, 1 << 14     # samples of a record around at most 10 distinct particles, and of others
+ASKED = {"beside": 0.08, "afar": 1.5}       # where a record with parallax is asked: deviation of each coordinate [scene units]
+FEW, SAMPLES = 1 << 18, 1 << 14     # samples of a record around at most 10 distinct particles, and of others; half with parallax
 MESH = 1 << 14                      # points of the quadrature, for each record
 PROBES = 1 << 10                    # directions of a record that are looked at one by one
 SPECIAL = [(0, 0, 1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, -1), (0.6, 0, 0.8), (0, 0.6, 0.8), (0.8, 0, -0.6),
@@ -90,7 +90,15 @@ class Population:
     @functools.cached_property
     def counts(self) -> np.ndarray:
         """Samples of each record."""
-        return np.where(self.proposals.count <= 10, FEW, SAMPLES)
+        return np.where(self.proposals.count <= 10, FEW, SAMPLES) // (1 if self.at is None else 2)
+
+    @functools.cached_property
+    def complete(self) -> np.ndarray:
+        """Records whose proposals look around every place of a narrow lobe [n_records].
+
+        One that was learnt from several particles may be re-aimed to anywhere between the directions where they are seen.
+        """
+        return self.proposals.complete & ((self.at is None) | (self.proposals.count <= 1))
 
     @functools.cached_property
     def proposed(self) -> Directions:
@@ -131,21 +139,24 @@ class Population:
 
 @functools.lru_cache(2)
 def population(seed: int, copies: int = COPIES, million: bool = True) -> Population:
-    """Records in every condition, in an order that puts neighbours into different ones."""
-    rng = np.random.default_rng([1, seed])
-    records = [(name, copy) for copy in range(copies) for name in CONDITIONS
-               if name != "a million" or (million and copy == 0)]
-    batches = [CONDITIONS[name](rng, copy) for name, copy in records]
-    return Population([name for name, _ in records],
-                      [[b[i] if i < len(b) else nothing() for b in batches] for i in range(BATCHES)], seed)
+    """Records in every condition."""
+    records = _records(copies, million)
+    return Population([name for name, _ in records], _batches(records, np.random.default_rng([1, seed])), seed)
 
 
 @functools.lru_cache(1)
 def population_with_parallax(seed: int) -> Population:
-    """Asked from beside the record, and from so far that light gets out of sight."""
-    rng = np.random.default_rng([2, seed])
-    counts = {"untrained": (0, 0), "one particle": (1, 0), "ten": (10, 0), "one batch": (150, 0), "on-line": (120, 60)}
-    conditions = [f"{name}, {where}" for where in ("beside", "afar") for name in counts]
-    at = np.concatenate([offset * rng.normal(size=(len(counts), 3)) for offset in (0.08, 1.5)])
-    return Population(conditions, [[many(counts[c.partition(",")[0]][i], rng) for c in conditions] for i in (0, 1)], seed,
-                      at.astype(np.float32))
+    """Records in every condition, asked from beside the record, and from so far that light gets out of sight."""
+    rng, records, asked = np.random.default_rng([2, seed]), _records(len(ASKED)), list(ASKED)
+    at = np.stack([ASKED[asked[copy]] * rng.normal(size=3) for _, copy in records]).astype(np.float32)
+    return Population([f"{name}, {asked[copy]}" for name, copy in records], _batches(records, rng), seed, at)
+
+
+def _records(copies: int, million: bool = True) -> list[tuple[str, int]]:
+    """Conditions and numbers of copies, in an order that puts neighbours into different conditions; only one has a million."""
+    return [(name, copy) for copy in range(copies) for name in CONDITIONS if name != "a million" or (million and copy == 0)]
+
+
+def _batches(records: list[tuple[str, int]], rng: np.random.Generator) -> list[list[Particles]]:
+    batches = [CONDITIONS[name](rng, copy) for name, copy in records]
+    return [[b[i] if i < len(b) else nothing() for b in batches] for i in range(BATCHES)]

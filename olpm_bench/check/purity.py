@@ -114,7 +114,10 @@ def both(check: Callable[..., Verdict]) -> Callable[..., Verdict]:
 
 @both
 def stay_pure(trials: Trials) -> Verdict:
-    """The arguments of the four verbs are left alone, and the same arguments give the same bits."""
+    """The arguments of the four verbs are left alone, and the same arguments give the same bits.
+
+    So nothing random comes from anywhere but the seed; who needs nothing random, or always the same, may leave that unused.
+    """
     r, n, seed = trials.representation, trials.n, trials.seed
     state, wrong, pictures = trials.init(n, seed), [], []
     if _differing(state, trials.init(n, seed)):

@@ -132,8 +132,6 @@ def run(subject: Subject, checks: Sequence[Check] = CHECKS, level: float = LEVEL
         start = time.perf_counter()
         try:
             verdict = check.run(subject, sidak(level, STATISTICAL))
-        except (KeyboardInterrupt, MemoryError):
-            raise
         except Exception as error:              # of other people's code
             from olpm_bench.bench.progress import is_interrupt, reason
             if is_interrupt(error):

@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 from typer.testing import CliRunner
 
-from olpm_bench.check import suite
+from olpm_bench.check import examination, suite
 from olpm_bench.check.particles import CONDITIONS, many, nothing, uniform_directions
 from olpm_bench.check.picture import CELL, over_disk
-from olpm_bench.check.population import population
+from olpm_bench.check.population import ASKED, population, population_with_parallax
 from olpm_bench.check.proposal import Proposals
 from olpm_bench.check.verdict import PValues, Verdict, combined, sidak
 from olpm_bench.cli import app
@@ -67,13 +67,18 @@ def test_proposals_have_their_density() -> None:
         assert abs(z) < stats.norm.isf(1e-3 / 6)
 
 
-def test_every_condition_is_in_the_population() -> None:
+def test_every_condition_is_in_both_populations() -> None:
     records = population(0)
     assert set(records.conditions) == set(CONDITIONS)
     assert max(len(records.of(r)[1]) for r in range(len(records))) > 1_000_000
     empty = [r for r in range(len(records)) if len(records.of(r)[1]) == 0]
     assert empty and all(records.conditions[r] in ("untrained", "few at a time") for r in empty)
     assert all(records.conditions[r] != records.conditions[r + 1] for r in range(len(records) - 1))
+    aimed = population_with_parallax(0)
+    everywhere = {f"{name}, {asked}" for name in CONDITIONS for asked in ASKED}
+    assert set(aimed.conditions) == everywhere - {"a million, afar"}
+    identical = aimed.conditions.index("ten identical, beside")
+    assert len(aimed.of(identical)[1]) == 10 and aimed.proposals.count[identical] == 1 and aimed.complete[identical]
 
 
 def test_the_disk_keeps_areas() -> None:
@@ -104,7 +109,7 @@ def test_a_failure_has_words_a_picture_and_an_exit_code(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("mutant", "check", "words"), [
     ("UntrainedTwoPercent", "many-records", "samples and pdf differ by -2"), ("OneNaN", "many-records", "record "),
-    ("SeedIgnored", "purity", "gives other bits")])
+    ("Unseeded", "purity", "gives other bits")])
 def test_what_fails_has_a_picture(tmp_path: Path, mutant: str, check: str, words: str) -> None:
     result = call(f"{MUTANTS}:{mutant}", "--only", check, "--pictures", tmp_path)
     picture, = tmp_path.rglob("*.png")
@@ -173,6 +178,35 @@ def test_a_campaign_goes_on_from_its_log(tmp_path: Path) -> None:
         assert result.exit_code == 2 and "line 6 is broken" in result.stderr and len(result.stderr.splitlines()) == 1
 
 
+@pytest.mark.parametrize(("power", "exit_code", "share"), [(1, 0, 0.1), (2, 1, 0.1**0.5), (0.5, 0, 0.01)],
+                         ids=["calibrated", "too small", "too large"])
+def test_a_campaign_judges_the_p_values_of_each_check(tmp_path: Path, power: float, exit_code: int, share: float) -> None:
+    """No alarm among 300 logged runs, and those of one check are u^power for uniform u."""
+    about = examination._about(suite.Subject({"type": "jensen"}), suite.named(["integral", "samples"]))
+    rng, log, n = np.random.default_rng(0), tmp_path / "log.jsonl", 300
+    runs = [{**about, "seed": seed, "passed": True, "p": rng.random(), "smallest": {"integral": rng.random(),
+             "samples": rng.random()**power}} for seed in range(n)]
+    log.write_text("".join(json.dumps(run) + "\n" for run in runs))
+    command = ["jensen", "--only", "integral", "--only", "samples", "--repeat", n, "--log", log]
+    result = call(*command)
+    assert result.exit_code == exit_code and f"0 of {n} runs raised an alarm" in result.stdout
+    lines = {line.split(":")[0].strip(): line for line in result.stdout.splitlines()[1:]}
+    assert {name for name, line in lines.items() if "FAILED" in line} == ({"samples"} if exit_code else set())
+    found = json.loads(call(*command, "--json").stdout)
+    assert found["passed"] == (exit_code == 0) and list(found["calibration"]) == ["all checks", "integral", "samples"]
+    count = found["calibration"]["samples"]["below"]["0.1"]
+    assert stats.binomtest(count, n, share).pvalue > 1e-3 and f"p < 0.1 in {count / n:.1%} and p < 0.01 in" in lines["samples"]
+
+
+def test_a_logged_run_without_its_p_values_is_refused(tmp_path: Path) -> None:
+    about = examination._about(suite.Subject({"type": "jensen"}), suite.named(["scale"]))
+    log = tmp_path / "log.jsonl"
+    for smallest in ({}, {"smallest": None}, {"smallest": {"scale": None}}):
+        log.write_text(json.dumps({**about, "seed": 0, "passed": True, "p": 1.0, **smallest}))
+        result = call("jensen", "--only", "scale", "--log", log)
+        assert result.exit_code == 2 and "line 1 is broken" in result.stderr
+
+
 @pytest.mark.parametrize(("arguments", "words"), [
     (["nosuch"], "unknown representation 'nosuch'"), (["jensen", "--only", "nosuch"], "unknown check 'nosuch'; known: density"),
     (["jensen", "--declare", "nosuch"], "--declare nosuch: must be one of constant, grows"),
@@ -186,3 +220,12 @@ def test_errors_of_other_peoples_code_are_failures() -> None:
     outcome, = suite.run(suite.Subject({"type": f"{MUTANTS}:FailsToRun"}), suite.named(["purity"]))
     assert not outcome.verdict.passed and outcome.verdict.worst.startswith("AttributeError: ")
     assert "mutants.py:" in outcome.verdict.worst
+
+
+def test_who_asks_for_too_much_memory_fails(tmp_path: Path) -> None:
+    (tmp_path / "greedy.py").write_text("import numpy as np\nfrom representations.jensen import JensenHistogram\n\n"
+                                        "class Greedy(JensenHistogram):\n    def update(self, state, batch, seed=0):\n"
+                                        "        return super().update(state, batch, seed + len(np.zeros(1 << 50)))\n")
+    result = call(f"{tmp_path}/greedy.py:Greedy", "--only", "scale", "--only", "purity", "--pictures", tmp_path)
+    assert result.exit_code == 1 and "2 of 2 checks FAILED" in result.stdout
+    assert "scale FAILED: " in result.stdout and "MemoryError: Unable to allocate 8.00 PiB" in result.stdout

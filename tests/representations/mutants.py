@@ -237,7 +237,7 @@ class InPlace(JensenHistogram):
         return new
 
 
-class SeedIgnored(HeyCones):
+class Unseeded(HeyCones):
     """Random numbers of a generator that nobody seeds."""
     generator = np.random.default_rng()
 
@@ -419,7 +419,7 @@ CAUGHT_BY = {
     ActiveForgotten: "inactive-lanes", ParallaxInSamplesOnly: "parallax-samples",
     ParallaxBelowTheHorizon: "parallax-density", ParallaxTenPercent: "parallax-integral",
     ParallaxNotReported: "parallax-reported", PdfTenPercentOfTrained: "furnace", OneSideNeverSampled: "image",
-    InPlace: "purity", SeedIgnored: "purity", ParallaxInPlace: "purity", ParallaxOfNeighbours: "independence",
+    InPlace: "purity", Unseeded: "purity", ParallaxInPlace: "purity", ParallaxOfNeighbours: "independence",
     ParallaxGrows: "memory", NumberOfAll: "new-records", NotAField: "new-records", ScaleMatters: "scale",
     OrderMatters: "independence",
     NeighboursListen: "independence", NothingIsNews: "nothing-new", FirstRecordsOnly: "new-records", LearnsNothing: "learning",

@@ -2,7 +2,7 @@
 
 Benedikt Bitterli's scenes come with images by his Tungsten.  They are in the same linear RGB, without tone mapping, and of paths
 of the depth that the scene's file gives.  But materials are not all the same (rough metal, glossy plastic), and nobody tells the
-images' noise: we expect means within 3 %, half of the blocks of pixels within 5 %, 95 of 100 within 15 %.  Found: 1.0 %, 2.8 %,
+images' noise: we expect means within 2 %, half of the blocks of pixels within 3.5 %, 95 of 100 within 13 %.  Found: 1.0 %, 2.8 %,
 11 % (Veach Ajar), 1.6 %, 2.3 % and 6 % (Veach Bidir), and single blocks of metal and glass that are off by up to 27 %.
 """
 from __future__ import annotations
@@ -41,6 +41,6 @@ def test_unguided_guided_and_foreign_images_agree(name: str):
     ours = blocks(guided.mean(0, keepdims=True), BLOCK)         # the less noisy ones
     h, w, _ = theirs.shape
     theirs = theirs.mean(-1).reshape(rows, h // rows, columns, w // columns).mean((1, 3)).ravel()
-    assert abs(ours.mean() / theirs.mean() - 1) < 0.03, (ours.mean(), theirs.mean())
+    assert abs(ours.mean() / theirs.mean() - 1) < 0.02, (ours.mean(), theirs.mean())
     off = abs(ours / theirs - 1)
-    assert np.median(off) < 0.05 and np.quantile(off, 0.95) < 0.15, np.quantile(off, (0.5, 0.95, 1))
+    assert np.median(off) < 0.035 and np.quantile(off, 0.95) < 0.13, np.quantile(off, (0.5, 0.95, 1))

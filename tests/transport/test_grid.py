@@ -31,6 +31,7 @@ TRAINING = {"passes": 2, "photons": 50_000, "importons": 20_000, "record_radius"
 DEPTH = 6
 PASSES, SPP = 32, 64
 LEVEL = 0.01                # probability that all tests together fail although nothing is wrong
+SEEN = 0.25                 # largest bias that may go unseen on a BSDF; transmissive `principled` comes to 0.16
 METHODS = ("unguided", *representations.names())
 
 
@@ -43,8 +44,8 @@ class Room(NamedTuple):
 
 FEW = ("diffuse", "conductor", "roughconductor", "dielectric", "plastic", "mask")
 TOGETHER = Room(tuple(name for name in EMITTERS if name not in ("constant", "envmap")))
-MOST = tuple(method for method in METHODS if method != "gaussian_mixture")     # which test_path.py has under each emitter
-ROOMS = {"constant": Room(("constant",), FEW, MOST), "envmap": Room(("envmap",), FEW, MOST), "the others": TOGETHER}
+ROOMS = {"constant": Room(("constant",), FEW, tuple(method for method in METHODS if method != "hey")),
+         "envmap": Room(("envmap",), FEW, tuple(method for method in METHODS if method != "cosine")), "the others": TOGETHER}
 ALONE = {name: Room((name,)) for name in EMITTERS if name != "directionalarea"}
 
 
@@ -95,6 +96,7 @@ class Comparison:
         error = np.sqrt(ours.whole.var(0, ddof=1) / len(ours.whole) + theirs.whole.var(0, ddof=1) / len(theirs.whole)) / mean
         # Nine times of ten: the threshold, and 1.28 standard errors more
         self.seen = error * (stats.t.isf(self.level / 2, whole.df) + 1.28)
+        assert np.isfinite([self.p, self.seen]).all(), "\n".join(self.lines())      # where all is black there is no test
 
     @property
     def rejected(self) -> dict[str, str]:
@@ -143,11 +145,12 @@ def test_emitters_that_shine_together_have_comparable_shares():
 
 
 def test_every_bsdf_under_every_emitter(room, method, request):
-    rooms, spp = (ALONE, 4 * SPP) if request.config.getoption("--grid") else (ROOMS, SPP)
+    grid = request.config.getoption("--grid")
+    rooms, spp = (ALONE, 4 * SPP) if grid else (ROOMS, SPP)
     found = compare(room, method, number_of_tests(rooms.values()), spp)
     print(f"{', '.join(room.emitters)}; {method}:", *found.lines(), sep="\n")
     assert not found.rejected, "\n".join(found.rejected.values())
-    assert np.median(found.seen) < 0.1
+    assert np.median(found.seen) < 0.1 and (grid or found.seen.max() < SEEN), "\n".join(found.lines())
 
 
 def _density_too_large(patch: pytest.MonkeyPatch) -> None:
@@ -157,12 +160,13 @@ def _density_too_large(patch: pytest.MonkeyPatch) -> None:
 
 
 def _specular_weight(patch: pytest.MonkeyPatch) -> None:
-    """Specular samples are not divided by the probability of asking the BSDF."""
+    """Specular samples of mixed BSDFs weigh a quarter too little."""
     one_sample = GuidedBSDF._one_sample
 
     def wrong(self, *args):
         bs, weight = one_sample(self, *args)
-        return bs, dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), weight * self.fraction, weight)
+        mixed = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (self.fraction < 1)
+        return bs, weight * dr.select(mixed, 0.75, 1)
     patch.setattr(GuidedBSDF, "_one_sample", wrong)
 
 
