@@ -54,7 +54,8 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
     """Draw what each pixel meets, the records of each method, and where the particles of its training land, by room, if the
     scene is an embedded one that has several; returns the files written.
 
-    The last method's guide guides the paths of the truth and of the image, which are unbiased with any.
+    The last method's guide guides the paths of the truth and of the image, which are unbiased with any; and it decides which
+    share of direct light the truth has, see :mod:`olpm_bench.bench.vertex`.
 
     Args:
         folder: of the experiment's results, which may not exist; pictures go to `inspect` in it.
@@ -91,7 +92,8 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
                               _train(loaded, spec, Results(folder), progress(index, f"training {method}")))
             guide = learnt[method].guide
             bar.say(f"{method}: {learnt[method].source}; {guide.records} records, {guide.trained:.0%} of them trained")
-        best = learnt[guided[-1].method.name].guide if guided else None
+        last = guided[-1].method.name if guided else None
+        best = learnt[last].guide if last is not None else None
         image = _image(loaded, (guided or specs)[-1], best)
         shown = records_seen(loaded, best).record if best is not None else None
         written = _records_maps(loaded, learnt, image, pixels, folder / "inspect" / slug(name))
@@ -103,7 +105,7 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
             columns = [_column(loaded, spec, at, truth, learnt.get(spec.method.name)) for spec in specs]
             title = f"{name}, pixel {pixel[0]},{pixel[1]}: vertex {at.number}, on {at.shape}"
             bar.say(f"{title}; noise of a sample: {', '.join(f'{c.name} {c.sampled.deviation:.2f}' for c in columns)}")
-            written += _write(picture.Page(title, image, shown, pixel, at, truth, columns), folder / "inspect", specs[0])
+            written += _write(picture.Page(title, image, shown, pixel, at, truth, columns, last), folder / "inspect", specs[0])
     return written
 
 
@@ -255,5 +257,6 @@ def _write(page: picture.Page, out: Path, spec: CellSpec) -> list[Path]:
         "schema_version": SCHEMA_VERSION, "scene": spec.scene.name, "pixel": page.pixel, "seed": spec.seed,
         "vertex": {"number": page.vertex.number, "position": page.vertex.p, "normal": page.vertex.frame[2],
                    "shape": page.vertex.shape},
-        "truth": {"bins": page.truth.bins, "paths": page.truth.paths, "noise": page.truth.noise}, "methods": methods})
+        "truth": {"bins": page.truth.bins, "paths": page.truth.paths, "noise": page.truth.noise, "guide": page.guide},
+        "methods": methods})
     return [out / f"{name}.{suffix}" for suffix in ("png", "pdf", "json")]

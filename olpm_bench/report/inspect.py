@@ -54,6 +54,7 @@ class Page:
     """One vertex.
 
     image: linear RGB (h, w, 3); shown: record of each pixel (h, w), or None without guides.
+    guide: the method whose guide decides which share of direct light the truth has; None without guides.
     """
     title: str
     image: np.ndarray
@@ -62,6 +63,7 @@ class Page:
     vertex: Vertex
     truth: Truth
     columns: Sequence[Column]
+    guide: str | None = None
 
 
 def draw(page: Page) -> Figure:
@@ -133,11 +135,14 @@ def _figures(fit: Fit | None) -> tuple[str, str]:
 
 def _caption(page: Page) -> str:
     t = page.truth
+    direct = "" if page.guide is None else (
+        f" Of direct light it has the share that the guide of \u201c{page.guide}\u201d is to learn; photons teach none of it, "
+        "which raises the KL of guides that learn from them alone.")
     return (
         "The hemisphere as an equal-area disk, seen along the normal; its rim is the horizon, and up is up in the image. "
-        f"Truth: {t.paths} paths for each of {t.bins} x {t.bins} bins, without the light that next-event estimation brings. "
-        "Top: what the record has learnt. Middle: what the path tracer samples, a mixture of BSDF and record. Bottom: what one "
-        "more pass would teach the record; the area of a dot is its weight. KL: divergence "
+        f"Truth: {t.paths} paths for each of {t.bins} x {t.bins} bins, without the light that next-event estimation brings."
+        f"{direct} Top: what the record has learnt. Middle: what the path tracer samples, a mixture of BSDF and record. Bottom: "
+        "what one more pass would teach the record; the area of a dot is its weight. KL: divergence "
         "KL(truth\u00a0||\u00a0pdf)\u00a0[nat]. \u03c3/\u03bc: relative standard deviation of truth / pdf, the noise of one "
         "sample.")
 

@@ -66,6 +66,7 @@ def test_a_results_folder_gives_the_passes_of_its_cells(experiment, tmp_path):
     assert all((folder / line).stat().st_size > 0 for line in result.stdout.split())
     shown = json.loads((folder / "cornell_box_8_10_vertex1.json").read_text())
     assert shown["vertex"]["number"] == 1 and shown["truth"]["paths"] == 128 and shown["seed"] == 3
+    assert shown["truth"]["guide"] == "Cosine"
     assert shown["vertex"]["shape"] == "low" and abs(shown["vertex"]["normal"][2]) < 1e-5   # the front of the low block
     plain, cosine = shown["methods"]["Path tracing"], shown["methods"]["Cosine"]
     assert plain["learnt"] is None and plain["fraction"] == 1 and cosine["record"] is not None

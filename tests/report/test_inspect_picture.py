@@ -1,6 +1,7 @@
 """The picture of `olpm-bench inspect`, from numbers alone."""
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import mitsuba as mi
@@ -56,6 +57,14 @@ def test_the_figures_are_under_the_disks_and_the_best_is_bold():
     assert any(text.startswith("0 where 5") and "% of the light" in text for text in shown)
     bold = [text for text, weight in shown.items() if weight == "bold"]
     assert len(bold) == 1 and "KL" in bold[0]
+
+
+@pytest.mark.parametrize("guide", [None, "Holes"])
+def test_the_caption_says_whose_direct_light_the_truth_has(guide):
+    with figures.style():
+        texts = [text.get_text().replace("\n", " ") for text in inspect.draw(dataclasses.replace(page(), guide=guide)).texts]
+    caption = next(text for text in texts if text.startswith("The hemisphere"))
+    assert ("the guide of \u201cHoles\u201d is to learn" in caption) == (guide is not None)
 
 
 def test_a_picture_without_light_and_without_records_can_be_drawn(tmp_path):
