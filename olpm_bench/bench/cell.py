@@ -25,6 +25,7 @@ from olpm_bench.bench.metrics import luminance
 from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.training import PassStatistics, Training
+from olpm_bench.transport.view import records_seen
 
 PASSES = 24                 # rendering passes in a budget, at least: so it is met within 1/24
 SHORTEST_PASS = 0.2         # [s]: below, the fixed cost of a pass shows
@@ -175,8 +176,9 @@ def power_of_two(n: float) -> int:
 class Measurement:
     """What a cell yields.
 
-    In `info`, `training_ended` are the charged seconds when the passes of training were done, None without: more than
-    `train_seconds`, which leave out the tracing of images that enter the result.
+    In `info`, `trained` is the share of the surfaces that the camera sees whose record guides paths, and `training_ended` are the
+    charged seconds when the passes of training were done: more than `train_seconds`, which leave out the tracing of images that
+    enter the result.  None without a guide, or training.
     """
     info: dict[str, Any]
     trace: list[dict[str, Any]]
@@ -314,7 +316,7 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
         "render_seconds": clock["render"].charged, "compile_seconds": warm.compile_seconds + kernels.seconds,
         "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
         "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
-        "trained": guide.trained if guide is not None else None, "training_ended": ended,
+        "trained": records_seen(scene, guide).guided if guide is not None else None, "training_ended": ended,
         "training_passes": sum(p["index"] < p["passes"] for p in cell.training),       # not those while rendering
         "warnings": list(dict.fromkeys(w for p in cell.training for w in p["warnings"])),
         "records": guide.records if guide is not None else 0, "particles": guide.particles if guide is not None else 0,

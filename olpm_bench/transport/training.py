@@ -26,12 +26,16 @@ import numpy as np
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.emission import EmissionGuide, distant_lights
-from olpm_bench.transport.gather import GATHERS, binned, by_record
+from olpm_bench.transport.gather import GATHERS, Gathered, binned, by_record
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
 from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings
+from olpm_bench.transport.view import records_seen
 from olpm_bench.transport.window import by_contribution
+
+LITTLE = 0.05       # of what the camera sees, that is guided, is told
+SETTLE = 3          # gathers from which the records of a single batch find their radii, as on-line in as many passes
 
 
 @dataclass
@@ -80,6 +84,9 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
             told.add(message)
         if on_pass is not None:
             on_pass(statistics)
+    if training.radiance.records and (guided := records_seen(scene, training.radiance, sensor).guided) < LITTLE:
+        warnings.warn(f"{guided:.1%} of what the camera sees is guided: too few particles, or light does not enter there",
+                      stacklevel=2)
     return training.radiance
 
 
@@ -249,13 +256,10 @@ class Training:
     def _learn(self, guide: Guide, particles: Particles, emitted: int, statistics: PassStatistics) -> int:
         if len(particles) == 0:             # nothing of this pass has reached a second surface
             return 0
-        with _Seconds(statistics, "grow"):
-            p, weight, _, _, n = particles.read(particles.place)
-            if self.settings.shrink:
-                guide.shrink()
-            guide.grow(p, n, weight > 0, self._next_seed())
-        with _Seconds(statistics, "gather"):
-            batch = GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours, self.settings.parallax)
+        if self.settings.shrink and self.settings.schedule == "single_batch":
+            for _ in range(SETTLE):         # there is no next pass in which records could be smaller
+                guide.measure(self._gather(guide, particles, statistics))
+        batch = self._gather(guide, particles, statistics)
         with _Seconds(statistics, "update"):
             if len(batch):
                 guide.learn_fluence(batch, emitted)
@@ -263,6 +267,16 @@ class Training:
             if self.settings.shrink:
                 guide.measure(batch)
         return len(batch)
+
+    def _gather(self, guide: Guide, particles: Particles, statistics: PassStatistics) -> Gathered:
+        """The particles of each record, when records have shrunk to what the last batch asked for, and new ones are added."""
+        with _Seconds(statistics, "grow"):
+            p, weight, _, _, n = particles.read(particles.place)
+            if self.settings.shrink:
+                guide.shrink()
+            guide.grow(p, n, weight > 0, self._next_seed())
+        with _Seconds(statistics, "gather"):
+            return GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours, self.settings.parallax)
 
     def _camera_pass(self, statistics: PassStatistics) -> PassStatistics:
         """Render an image with the guide as it is, and learn from its paths."""

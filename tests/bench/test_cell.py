@@ -154,6 +154,7 @@ def trained(experiment, monkeypatch):
     monkeypatch.setattr(cell, "Clock", Ticking)
     monkeypatch.setattr(cell, "Training", Passes)
     monkeypatch.setattr(cell, "make_integrator", lambda spec, guide: None)
+    monkeypatch.setattr(cell, "records_seen", lambda scene, guide: SimpleNamespace(guided=1.0))
     monkeypatch.setattr(cell, "render_pass", lambda *_: SimpleNamespace(numpy=lambda: np.full((12, 16, 3), 100.0)))
     return measured
 

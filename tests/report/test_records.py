@@ -11,7 +11,7 @@ from olpm_bench.transport.view import RecordView
 def _view() -> tuple[RecordView, np.ndarray]:
     record = np.repeat(np.arange(-1, 3), 8).reshape(4, 8)
     radius, count = np.array([0.1, 0.5, 1, np.nan])[record], np.array([10, 100, 1000, 0])[record]
-    return RecordView(record, radius, count), np.random.default_rng(0).uniform(0, 1, (4, 8, 3))
+    return RecordView(np.ones((4, 8), bool), record, radius, count), np.random.default_rng(0).uniform(0, 1, (4, 8, 3))
 
 
 def test_cells_have_colours_of_their_own():
@@ -29,6 +29,15 @@ def test_titles_state_the_shares():
     assert titles[2] == "particles seen; 50.0% of the pixels have 80 or more"
 
 
+def test_the_share_that_guides_is_of_surfaces_that_can_be_guided_from():
+    view, _ = _view()
+    assert view.guided == 0.5
+    view.surface[:1] = False                # a row without record
+    assert view.guided == 2 / 3
+    view.surface[:] = False
+    assert view.guided == 1
+
+
 def test_the_picture_is_written_with_its_marks(tmp_path):
     records.records_map(*_view(), 80, tmp_path / "map.png")
     records.records_map(*_view(), 80, tmp_path / "marked.png", marks=[(6, 2)])
@@ -38,6 +47,6 @@ def test_the_picture_is_written_with_its_marks(tmp_path):
 
 
 def test_a_guide_without_records_can_be_shown(tmp_path):
-    empty = RecordView(np.full((4, 8), -1), np.full((4, 8), np.nan), np.zeros((4, 8)))
+    empty = RecordView(np.ones((4, 8), bool), np.full((4, 8), -1), np.full((4, 8), np.nan), np.zeros((4, 8)))
     records.records_map(empty, np.zeros((4, 8, 3)), 80, tmp_path / "map.pdf")
     assert (tmp_path / "map.pdf").is_file()

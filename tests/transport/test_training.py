@@ -116,6 +116,15 @@ def test_single_batch_is_one_unguided_fit(scene):
     assert guide.count.numpy().max() <= SMALL.neighbours
 
 
+def test_records_of_a_single_batch_shrink_before_the_fit(scene):
+    """To what the paper's records reach on-line, from the same photons again and again: nothing is learnt twice."""
+    single = settings.with_changes(PARTICLES, {"schedule": "single_batch", "gather": "nearest", **SHRINKING})
+    guide = train(scene, "jensen", single, PATHS)
+    radii = guide.cache.radii / guide.cache.radius
+    assert np.mean(radii < 0.8) > 0.3 and radii.min() >= 0.0999
+    assert guide.count.numpy().max() <= SHRINKING["neighbours"]
+
+
 def test_importons_first_guide_photons_that_teach_them_nothing(scene):
     first = settings.with_changes(PARTICLES, {"schedule": "importons_first", "passes": 2})
     training = Training(scene, "gaussian_mixture", first, PATHS)
@@ -208,6 +217,14 @@ def test_a_room_that_no_light_enters_is_told_and_black():
     with pytest.warns(UserWarning, match="no camera path has met light"):
         guide = train(scene, "gaussian_mixture", SMALL, PATHS)
     assert guide.records and not mi.render(scene, integrator=olpm_bench.integrator(guide, max_depth=DEPTH), spp=16).numpy().any()
+
+
+def test_a_room_that_no_light_enters_is_told_without_camera_passes():
+    """Photons land beside it, in records that no camera path meets."""
+    few = settings.training("paper2014", passes=2, photons=5_000, importons=2_000, record_radius=0.03)
+    with pytest.warns(UserWarning, match="of what the camera sees is guided: too few"):
+        guide = train(load("door_ajar", {"gap": 0}, 16, 9), "gaussian_mixture", few, PATHS)
+    assert guide.trained > 0.2
 
 
 @pytest.mark.filterwarnings("ignore:none of")
