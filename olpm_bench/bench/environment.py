@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
 import platform
 import socket
@@ -73,18 +74,19 @@ def package_version() -> str:
 
 
 def commit() -> str | None:
-    """The git commit of this software, with "+" if the tree has changes; None where there is no clone of it.
+    """The git commit of this software, with "+" if the tree has changes; None where it is not known: installed from a folder.
 
-    An installed package has no history: then it is that of the clone one works in.
+    No other folder is asked, also not the current one: git runs what a folder's .git/config names.
     """
-    for folder in (Path(__file__).resolve().parents[2], Path.cwd()):
-        if (folder / ".git").exists() and (folder / "olpm_bench").is_dir():
-            try:
-                changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
-                return _git(folder, "rev-parse", "HEAD") + ("+" if changed else "")
-            except (OSError, subprocess.SubprocessError):
-                continue
-    return None
+    folder = Path(__file__).resolve().parents[2]
+    try:
+        if not (folder / ".git").exists():              # PEP 610: what `pip install git+https://...` has noted
+            noted = importlib.metadata.distribution("olpm-bench").read_text("direct_url.json")
+            return json.loads(noted or "{}").get("vcs_info", {}).get("commit_id")
+        changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+        return _git(folder, "rev-parse", "HEAD") + ("+" if changed else "")
+    except (OSError, ValueError, subprocess.SubprocessError, importlib.metadata.PackageNotFoundError):
+        return None
 
 
 def _git(folder: Path, *arguments: str) -> str:

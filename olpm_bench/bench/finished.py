@@ -84,6 +84,13 @@ class FinishedScene:
         return {method: statistics.speed_up(curves[self.baseline], curves[method]) if {self.baseline, method} <= curves.keys()
                 else unknown for method in self.cells if method != self.baseline}
 
+    @cached_property
+    def worst_speed_ups(self) -> dict[str, float]:
+        """Method -> its least speed-up over the baseline, of all L1 errors that both reach; empty without reference."""
+        curves = self.curves() if self.reference is not None else {}
+        return {method: statistics.worst_speed_up(curves[self.baseline], curve) for method, curve in curves.items()
+                if self.baseline in curves}
+
 
 @dataclass(frozen=True)
 class Finished:

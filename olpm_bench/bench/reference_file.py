@@ -81,9 +81,14 @@ def read_reference(path: Path, width: int, height: int) -> Reference:
 
 
 def _of_halves(parts: dict[str, np.ndarray], meta: dict[str, Any], path: Path, width: int, height: int) -> Reference:
+    remedy = "another program may have written it; remove the folder and make it again"
     for name in ("a.mean", "b.mean", "a.variance", "b.variance"):
-        if name not in parts or not np.isfinite(parts[name]).all():
-            raise ResultError(f"{path} is broken: no finite part '{name}'; remove the folder and make it again")
+        image = parts.get(name)
+        if image is None or image.shape != (*parts["a.mean"].shape[:2], 3) or not np.isfinite(image).all():
+            raise ResultError(f"{path} is broken: no finite RGB part '{name}' of the size of 'a.mean'; {remedy}")
+    for name in ("spp_a", "spp_b"):
+        if not isinstance(n := meta.get(name), int) or not 0 < n < 2**63:
+            raise ResultError(f"{path} is broken: {name} = {n!r}, must be the samples of a half; {remedy}")
     averaged = parts["a.mean"].shape[1] // width                # pixels that become one, along a side
     images = [_shrink(parts[name], width, height, path) for name in ("a.mean", "b.mean", "a.variance", "b.variance")]
     return Reference(images[0], images[1], images[2] / averaged ** 2, images[3] / averaged ** 2, meta)

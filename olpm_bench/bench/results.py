@@ -11,8 +11,8 @@ A result folder (`results/<stem of the TOML>`):
                                   failed.json       why there is no cell.json
                                   lock              who is at work on it
 
-Every file is written beside its place and renamed, so that it is whole or not there.  JSON has no NaN: null.  Images, traces
-and cell.json carry digests: what a disk, a copy or an editor has changed is not believed.
+Every file is written beside its place and renamed, so that it is whole or not there.  JSON has no NaN: null.  cell.json holds
+digests of itself and of the files beside it: what a disk, a copy or an editor has changed, or is another cell's, is not believed.
 """
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ import json
 import os
 import shutil
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,9 @@ from olpm_bench.bench.files import (
     write_text,
     writer,
 )
+from olpm_bench.bench.lock import Alive
 
+TRAINED = 0.5           # share of what the camera sees whose records guide, below which that is told
 # What a report draws, as far as there is something to draw.
 DRAWN = (*(f"{name}.{suffix}" for name in ("figure", "gains", "sweep") for suffix in ("png", "pdf", "svg")),
          "sheet.png", "crops.png", "crops.pdf", "report.html")
@@ -56,10 +59,11 @@ class Cell:
     info: dict[str, Any]            # cell.json
     trace: list[dict[str, Any]]     # one dict a checkpoint
     folder: Path
+    size: tuple[int, int] | None = None         # (height, width) that its images must have, where that is known
 
     def image(self) -> dict[str, np.ndarray]:
         """``mean`` (h, w, 3), ``variance`` of the mean (h, w, 3; infinite after a single pass), ``count`` (h, w, 1)."""
-        parts, _ = read_exr(self.folder / "image.exr")
+        parts = self._parts("image.exr")
         for name in ("mean", "variance", "count"):
             if name not in parts:
                 raise ResultError(f"{self.folder / 'image.exr'} is broken: no part '{name}'")
@@ -71,21 +75,45 @@ class Cell:
 
     def checkpoints(self) -> list[np.ndarray]:
         """The mean image (h, w, 3) at each line of the trace."""
-        parts, _ = read_exr(self.folder / "checkpoints.exr")
+        parts = self._parts("checkpoints.exr")
         if set(parts) != {str(i) for i in range(len(self.trace))}:
             raise ResultError(f"{self.folder / 'checkpoints.exr'} is broken: {len(parts)} images for {len(self.trace)} "
                               "checkpoints")
         return [parts[str(i)] for i in range(len(self.trace))]
 
+    def _parts(self, name: str) -> dict[str, np.ndarray]:
+        parts, _ = read_exr(self.folder / name)
+        for image in parts.values():
+            if (found := image.shape[:2]) != (size := self.size or found):
+                raise ResultError(f"{self.folder / name} is broken: {found[1]}x{found[0]} pixels in place of {size[1]}x{size[0]}")
+        return parts
 
-def _digests(info: dict[str, Any], trace: Path) -> dict[str, str]:
-    """What cell.json says of itself and of the trace.  Its key is compared with the experiment's instead."""
+
+def warnings(cells: Sequence[Cell]) -> list[str]:
+    """What the training of a method's cells in a scene has warned of, once each; and how much of what the camera sees is
+    guided, in the cell that has least, if that is little."""
+    said = [warning for cell in cells for warning in cell.info.get("warnings", [])]         # older cells say less
+    trained = min((share for cell in cells if (share := cell.info.get("trained")) is not None), default=1.0)
+    if trained < TRAINED:
+        said.append(f"only {trained:.0%} of the surfaces that the camera sees have records with particles enough to guide: more "
+                    "photons or passes, or a larger record_radius; or light does not enter what it sees")
+    return list(dict.fromkeys(said))
+
+
+def _digests(info: dict[str, Any], folder: Path) -> dict[str, str]:
+    """What cell.json says of itself and of the files beside it.  Its key is compared with the experiment's instead.
+
+    Raises:
+        ResultError: one is missing.
+    """
     measured = {name: value for name, value in info.items() if name != "key"}
-    try:
-        content = trace.read_bytes()
-    except OSError as error:
-        raise ResultError(f"{trace} is broken: {error}") from None
-    return {"cell.json": digest(json.dumps(measured, sort_keys=True).encode()), "trace.jsonl": digest(content)}
+    found = {"cell.json": digest(json.dumps(measured, sort_keys=True).encode())}
+    for name in ("trace.jsonl", "image.exr", "checkpoints.exr"):
+        try:
+            found[name] = digest((folder / name).read_bytes())
+        except OSError as error:
+            raise ResultError(f"{folder / name} is broken: {error}") from None
+    return found
 
 
 class Results:
@@ -132,46 +160,57 @@ class Results:
     def cell_folder(self, scene: str, method: str, seed: int) -> Path:
         return self.folder / "cells" / slug(scene) / slug(method) / str(seed)
 
-    def read_cell(self, scene: str, method: str, seed: int) -> Cell | None:
+    def read_cell(self, scene: str, method: str, seed: int, size: tuple[int, int] | None = None) -> Cell | None:
         """The cell if it is complete, else None.
 
+        Older cells have no digests of their images, or none at all: those are believed.
+
+        Args:
+            size: (height, width) that its images must have.
+
         Raises:
-            ResultError: it has a cell.json, but that or the trace is broken.
+            ResultError: it has a cell.json, but that or a file beside it is broken, or another cell's.
             NewerSchemaError: of a later version.
         """
         folder = self.cell_folder(scene, method, seed)
         if not (folder / "cell.json").exists():
             return None
         info = read_json(folder / "cell.json")
-        digests = info.pop("digests", {})           # older cells have none
-        if digests and digests != _digests(info, folder / "trace.jsonl"):
-            raise ResultError(f"{folder / 'cell.json'} or trace.jsonl is broken: their digests are others")
+        digests = info.pop("digests", None)
+        if not isinstance(digests, dict):
+            raise ResultError(f"{folder / 'cell.json'} is broken: it has no digests")
+        if digests:
+            found = _digests(info, folder)
+            for name, said in digests.items():
+                if said != found.get(name):
+                    raise ResultError(f"{folder / name} is broken: its digest is another")
         try:
             lines = (folder / "trace.jsonl").read_text(encoding="utf-8").splitlines()
             trace = [json.loads(line) for line in lines if line.strip()]
         except (OSError, ValueError) as error:
             raise ResultError(f"{folder / 'trace.jsonl'} is broken: {error}") from None
-        return Cell(scene, method, seed, info, trace, folder)
+        return Cell(scene, method, seed, info, trace, folder, size)
 
-    def verified_cell(self, scene: str, method: str, seed: int) -> Cell | None:
+    def verified_cell(self, scene: str, method: str, seed: int, size: tuple[int, int] | None = None) -> Cell | None:
         """As `read_cell`, and its images can be read."""
-        cell = self.read_cell(scene, method, seed)
+        cell = self.read_cell(scene, method, seed, size)
         if cell is not None:
             cell.image()
             cell.checkpoints()
         return cell
 
     def write_cell(self, scene: str, method: str, seed: int, info: dict[str, Any], trace: list[dict[str, Any]],
-                   image: dict[str, np.ndarray], checkpoints: list[np.ndarray],
-                   config: dict[str, Any] | None = None) -> Cell:
+                   image: dict[str, np.ndarray], checkpoints: list[np.ndarray], config: dict[str, Any] | None = None,
+                   alive: Alive | None = None) -> Cell:
         """Write a complete cell, cell.json last.
 
         Args:
             image: ``mean`` and ``variance`` (h, w, 3), ``count`` (h, w).
             config: what goes into the header of the image.
+            alive: of the lock: who has lost it leaves what is there to who took it over.
 
         Raises:
-            OSError: cannot be written; what was there stays as it was.
+            OSError, LockedError: cannot be written, or not by us any more; what was there stays as it was.
         """
         folder = self.cell_folder(scene, method, seed)
         new = folder / f".cell.{writer()}.tmp"
@@ -180,7 +219,9 @@ class Results:
             write_exr(new / "image.exr", image, config)
             write_exr(new / "checkpoints.exr", {str(i): c for i, c in enumerate(checkpoints)})
             write_text(new / "trace.jsonl", "".join(json.dumps(plain(line), allow_nan=False) + "\n" for line in trace))
-            write_json(new / "cell.json", {**info, "digests": _digests(info, new / "trace.jsonl")})
+            write_json(new / "cell.json", {**info, "digests": _digests(info, new)})
+            if alive is not None:
+                alive(at_once=True)         # after all that takes long
             (folder / "cell.json").unlink(missing_ok=True)      # an old cell.json never stands beside new images
             for name in ("image.exr", "checkpoints.exr", "trace.jsonl", "cell.json"):
                 os.replace(new / name, folder / name)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
+import representations
 from olpm_bench.bench import environment
 from olpm_bench.bench.cell import CellFailedError, WarmUp, load_scene, measure, spp_of_pass, warm_up
 from olpm_bench.bench.clock import WAITED
@@ -17,7 +18,7 @@ from olpm_bench.bench.files import NewerSchemaError, ResultError, require_inside
 from olpm_bench.bench.lock import LockedError, locked, remove_unfinished, tidy
 from olpm_bench.bench.progress import Bar, is_interrupt, reason
 from olpm_bench.bench.reference_file import Reference, find_reference, read_reference
-from olpm_bench.bench.results import DRAWN, Cell, Results
+from olpm_bench.bench.results import DRAWN, Cell, Results, warnings
 from olpm_bench.bench.shard import WHOLE, Shard
 from olpm_bench.transport import camera_paths, headroom
 from olpm_bench.transport.settings import InputError
@@ -27,7 +28,10 @@ if TYPE_CHECKING:
 
 LARGER = 8                  # references are averaged down by whole factors up to this
 PATIENCE = 2.0              # [s] between looks at what is in other hands
-TRAINED = 0.5               # share of trained records below which a guide is reported: most paths are then unguided
+# Bytes that a hit of a particle takes, at most: as `particles.trace` keeps it, and in all arrays while a gather brings it to the
+# records.  The window of expected contributions may split particles until the room for hits is full, twice those of their paths.
+STORED, SPLIT = 52, 2
+GATHERED = {"binned": 50, "nearest": 130}
 
 
 def references(experiment: Experiment, root: Path) -> dict[str, Reference]:
@@ -126,10 +130,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
             if cell is not None:
                 info = cell.info
                 flag = f", waited {info['wait_fraction']:.0%} for busy cores" if info["wait_fraction"] > WAITED else ""
-                if info["trained"] is not None and info["trained"] < TRAINED:
-                    flag += (f"; only {info['trained']:.0%} of the records have seen particles enough to guide: "
-                             "more photons or passes, or a larger record_radius")
-                flag += "".join(f"; {warning}" for warning in info["warnings"])
+                flag += "".join(f"; {warning}" for warning in warnings([cell]))
                 bar.say(f"[{index + 1}/{len(todo)}] {spec}: {info['spp']} spp in {info['charged_seconds']:.1f} s, "
                         f"{info['train_seconds']:.1f} s of it training{flag}")
     return problems
@@ -142,7 +143,7 @@ def is_complete(results: Results, spec: CellSpec) -> tuple[bool, str]:
         NewerSchemaError: written by a later version.
     """
     try:
-        cell = results.verified_cell(spec.scene.name, spec.method.name, spec.seed)
+        cell = results.verified_cell(spec.scene.name, spec.method.name, spec.seed, (spec.scene.height, spec.scene.width))
     except NewerSchemaError:
         raise
     except ResultError as error:
@@ -177,17 +178,27 @@ def _run_cell(results: Results, spec: CellSpec, scene: mi.Scene, warm: dict[tupl
             done = measure(spec, scene, warm[pair], on_progress=on_progress)
         except (LockedError, NewerSchemaError):
             raise
-        except (CellFailedError, InputError) as error:      # e.g. too little memory
-            results.write_failure(*names, str(error))
-            raise CellFailedError(str(error)) from error
-        except RuntimeError as error:           # of Mitsuba or Dr.Jit: the other cells may still work
+        except Exception as error:              # the other cells may still work
             if is_interrupt(error):
                 raise KeyboardInterrupt from error
-            results.write_failure(*names, reason(error))
-            raise CellFailedError(reason(error)) from error
+            if (why := _why(spec, error)) is None:
+                raise
+            results.write_failure(*names, why)
+            raise CellFailedError(why) from error
         info = {**done.info, "machine": environment.machine()}
-        alive(at_once=True)                     # who was silent for too long leaves the cell to who took it over
-        return results.write_cell(*names, info, done.trace, done.image, done.checkpoints, spec.config())
+        return results.write_cell(*names, info, done.trace, done.image, done.checkpoints, spec.config(), alive)
+
+
+def _why(spec: CellSpec, error: Exception) -> str | None:
+    """Why a cell has failed, if it is for its input, for Mitsuba, for want of memory, or for other people's code that it runs;
+    else None: the others would fail, too."""
+    if isinstance(error, CellFailedError | InputError):         # e.g. too little memory
+        return str(error)
+    if isinstance(error, RuntimeError | MemoryError):
+        return reason(error)
+    if representations.file_of(spec.method.representation_name or "") is not None:
+        return f"{type(error).__name__}: {reason(error)}"
+    return None
 
 
 def plan(experiment: Experiment, root: Path, shard: Shard = WHOLE) -> dict[str, Any]:
@@ -201,17 +212,20 @@ def plan(experiment: Experiment, root: Path, shard: Shard = WHOLE) -> dict[str, 
 
 
 def memory(spec: CellSpec) -> float:
-    """Estimate of the memory of a cell [GB]: Mitsuba itself, paths in flight, particles and vertices of a pass, images."""
+    """Memory that a cell takes, at most [GB]: Mitsuba itself, paths in flight, particles and vertices of a pass, images."""
     pixels = spec.scene.width * spec.scene.height
     lanes = pixels * (spp_of_pass(spec) if spec.budget.spp is not None else 16)
     particles, vertices = 0, 0
     if (training := spec.training) is not None:
-        single = training.passes if training.schedule == "single_batch" else 1
-        particles = 8 * single * (training.photons + training.importons)        # about 8 hits a path
+        rows, single = camera_paths.rows_of(spec.integrator.max_depth), training.schedule == "single_batch"
+        passes, importons = (training.passes, 0) if single else (min(training.passes, 1), training.importons)
+        hits = passes * (training.photons + importons) * max(rows - 1, 1)
+        if training.weight_window == "contribution" and not single:
+            hits *= SPLIT
+        particles = hits * (STORED + GATHERED[training.gather])
         if training.camera_passes or training.while_rendering:
-            paths = min(max(training.camera_paths, pixels), camera_paths.MOST_PATHS)
-            vertices = camera_paths.rows_of(spec.integrator.max_depth) * paths
-    return (300e6 + 120 * lanes + 100 * particles + camera_paths.BYTES * vertices
+            vertices = rows * min(max(training.camera_paths, pixels), camera_paths.MOST_PATHS)
+    return (300e6 + 120 * lanes + particles + camera_paths.BYTES * vertices
             + pixels * 3 * (8 * 4 + 4 * spec.budget.checkpoints)) / 1e9
 
 

@@ -202,6 +202,17 @@ def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Inte
     return interval._replace(value=value, bound=bound)
 
 
+def worst_speed_up(baseline: Curve, method: Curve) -> float:
+    """The least ratio of the times at which two median curves are down to the same error, of all errors that both reach.
+
+    Looked for at the points of either curve: between them the ratio's logarithm is linear in that of the error.  When a curve
+    was down to what it is below from the start was not measured.  NaN where there is no such error.
+    """
+    a, b = baseline.median, method.median
+    ratios = [time_to_error(baseline.times, a, error) / time_to_error(method.times, b, error) for error in (*a, *b)]
+    return min((ratio for ratio in ratios if np.isfinite(ratio)), default=float("nan"))
+
+
 def gain(baseline: Work, method: Work) -> Interval:
     """Work-normalised variance of the baseline over that of the method, with a paired jackknife interval.
 

@@ -7,6 +7,7 @@ tasks of one array, each with a node of its own; the "local" executor runs the s
 from __future__ import annotations
 
 import math
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,9 @@ def submit(experiment: Experiment, root: Path, cluster: str, workers: int, minut
     if not environment.uses_llvm():
         executor.update_parameters(gpus_per_node=1)
     if cluster == "slurm":
+        if timed and slurm.get("constraint") is None:
+            print(f"olpm-bench: the budget of {experiment.path.name} is in seconds, and without --constraint its cells may land "
+                  "on different CPU models, whose seconds do not compare", file=sys.stderr)
         # srun would bind its one task to one core, and give it the memory of one; the node is ours.
         executor.update_parameters(
             nodes=1, tasks_per_node=1, slurm_exclusive=True, slurm_additional_parameters={"mem": 0},

@@ -15,16 +15,17 @@ import numpy as np
 from olpm_bench.bench import metrics, statistics
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
-from olpm_bench.bench.results import Cell, Results
+from olpm_bench.bench.results import Cell, Results, warnings
 
 LATE = 0.05                 # share of a budget in seconds by which a cell may exceed it, before that is said
+SLOWER = 0.95               # `worst_speed_up` below which that is said
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
     from olpm_bench.bench.config import Experiment
-    from olpm_bench.bench.finished import Final, Finished
+    from olpm_bench.bench.finished import Finished, FinishedScene
 
 
 def complete_cells(experiment: Experiment, results: Results, any_version: bool = False) -> dict[tuple[str, str], list[Cell]]:
@@ -40,7 +41,8 @@ def complete_cells(experiment: Experiment, results: Results, any_version: bool =
     cells: dict[tuple[str, str], list[Cell]] = {
         (scene.name, method.name): [] for scene in experiment.scene for method in experiment.method}
     for spec in experiment.cells():
-        cell = results.read_cell(spec.scene.name, spec.method.name, spec.seed)
+        size = spec.scene.height, spec.scene.width
+        cell = results.read_cell(spec.scene.name, spec.method.name, spec.seed, size)
         if cell is None or not (cell.info.get("key") == spec.key
                                 or (any_version and _agrees(cell.config(), plain(spec.config())))):
             state = "missing" if cell is None else "of another configuration"
@@ -63,12 +65,11 @@ def summarise(finished: Finished) -> dict[str, Any]:
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
     `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, and `overrun` is the
     largest share by which a cell exceeds a budget in seconds.  `gain` is the baseline's work-normalised variance over the
-    method's, with its 90 % jackknife interval.  What has no value (a spread of one seed, the error of a scene without reference)
-    is None.
+    method's, with its 90 % jackknife interval, and `worst_speed_up` by `statistics.worst_speed_up`; `warnings` are those of
+    training.  What has no value (a spread of one seed, the error of a scene without reference) is None.
     """
     budget = finished.experiment.budget.seconds
-    rows = [_row(scene.scene.name, method, scene.cells[method], final, budget)
-            for scene in finished.scenes for method, final in scene.final.items()]
+    rows = [_row(scene, method, budget) for scene in finished.scenes for method in scene.cells]
     return {"schema_version": SCHEMA_VERSION, "rows": rows}
 
 
@@ -78,13 +79,14 @@ def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work
     return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
 
 
-def _row(scene: str, method: str, cells: Sequence[Cell], final: Final, budget: float | None) -> dict[str, Any]:
+def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, Any]:
+    cells, final = scene.cells[method], scene.final[method]
     info = {key: np.array([cell.info[key] for cell in cells], np.float64) for key in (      # null becomes NaN
         "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
         "bytes_per_record", "particles", "mean", "mean_stderr", "charged_seconds")}
     l1, gain = statistics.median_band(final.errors["l1"]), final.gain
     return plain({
-        "scene": scene, "method": method, "seeds": [cell.seed for cell in cells],
+        "scene": scene.scene.name, "method": method, "seeds": [cell.seed for cell in cells],
         "l1": l1.median, "l1_low": l1.low, "l1_high": l1.high,
         **{name: np.median(values) for name, values in final.errors.items()},
         "work_normalised_variance": final.work_normalised_variance,
@@ -98,6 +100,7 @@ def _row(scene: str, method: str, cells: Sequence[Cell], final: Final, budget: f
         "spp": _whole(np.median(info["spp"])), "records": _whole(np.median(info["records"])),
         "bytes_per_record": _whole(np.median(info["bytes_per_record"])),
         "particles": _whole(np.median(info["particles"])),
+        "worst_speed_up": scene.worst_speed_ups.get(method), "warnings": warnings(cells),
     })
 
 
@@ -106,12 +109,14 @@ def _whole(value: np.floating) -> int:
 
 
 def write(summary: dict[str, Any], results: Results) -> None:
-    """Write summary.json and table.csv (seeds separated by spaces, empty for no value) into the results folder."""
+    """Write summary.json and table.csv (seeds separated by spaces, warnings by semicolons, empty for no value) into the results
+    folder."""
     results.write_json("summary.json", summary)
     text = io.StringIO()
     table = csv.DictWriter(text, list(summary["rows"][0]), lineterminator="\n")
     table.writeheader()
-    table.writerows({**row, "seeds": " ".join(map(str, row["seeds"]))} for row in summary["rows"])
+    table.writerows({**row, "seeds": " ".join(map(str, row["seeds"])), "warnings": "; ".join(row["warnings"])}
+                    for row in summary["rows"])
     results.write_text("table.csv", text.getvalue())
 
 
@@ -126,7 +131,6 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
     for name in ("method", "L1", "5-95 %", "relMSE", "trimmed", "var x s", "gain", "passes", "train s", "render s", "spp",
                  "records"):
         table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
-    notes = []
     for scene in scenes:
         rows = [row for row in summary["rows"] if row["scene"] == scene]
         table.add_row(Text(scene, style="bold"), *[""] * 11)
@@ -139,19 +143,13 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
                 number(row["relmse"]), number(row["relmse_trimmed"]), number(row["work_normalised_variance"]),
                 _gain(row), f"{row['training_passes']}",
                 f"{row['train_seconds']:.1f}", f"{row['render_seconds']:.1f}", f"{row['spp']}", f"{row['records']}")
-            label = f"{scene} / {row['method']}"
-            if row["wait_fraction"] > WAITED:
-                notes.append(f"{label}: waited {row['wait_fraction']:.0%} of its time for a busy core")
-            if row["overrun"] is not None and row["overrun"] > LATE:
-                notes.append(f"{label}: took {row['overrun']:.0%} more time than its budget")
     console = console or Console()
     print_whole(table, console)
-    for note in notes:
-        console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    _print_notes(summary, console)
 
 
 def print_metrics(summary: dict[str, Any], console: Console | None = None) -> None:
-    """Print every metric of every row."""
+    """Print every metric of every row, and what is to be known of the cells."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -161,7 +159,29 @@ def print_metrics(summary: dict[str, Any], console: Console | None = None) -> No
         table.add_column(name, justify="left" if name in ("scene", "method") else "right", no_wrap=True)
     for row in summary["rows"]:
         table.add_row(Text(row["scene"]), Text(row["method"]), *(number(row[name]) for name in metrics.METRICS))
-    print_whole(table, console or Console())
+    console = console or Console()
+    print_whole(table, console)
+    _print_notes(summary, console)
+
+
+def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What is to be known of the cells of a table's rows: that they waited, took long, had to warn, or were overtaken."""
+    found = []
+    for row in rows:
+        said = list(row["warnings"])
+        if row["wait_fraction"] > WAITED:
+            said.append(f"waited {row['wait_fraction']:.0%} of its time for a busy core")
+        if row["overrun"] is not None and row["overrun"] > LATE:
+            said.append(f"took {row['overrun']:.0%} more time than its budget")
+        if row["worst_speed_up"] is not None and row["worst_speed_up"] < SLOWER:
+            said.append(f"{row['worst_speed_up']:.2g}x as fast as the baseline to the L1 error where it compares worst")
+        found += [f"{row['scene']} / {row['method']}: {words}" for words in said]
+    return found
+
+
+def _print_notes(summary: dict[str, Any], console: Console) -> None:
+    for note in notes(summary["rows"]):
+        console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 def print_whole(table: Table, console: Console) -> None:

@@ -72,7 +72,7 @@ def page(found: Finished, rows: Sequence[Mapping[str, Any]], blocks: Sequence[sh
     text = environment.get_template(TEMPLATE).render(
         experiment=experiment, budget=sheet.budget(experiment), commands=commands(experiment, results),
         command=commands(experiment, results)[-1], machines="; ".join(found.machines),
-        viewers=viewers(found, blocks), headers=HEADERS, rows=table(rows),
+        viewers=viewers(found, blocks), headers=HEADERS, rows=table(rows), notes=summary.notes(rows),
         speed_ups=summary.speed_up_lines(found.speed_ups, experiment.baseline_name),
         figures=[{"name": name, "svg": svg(results.folder / f"{name}.svg", CAPTIONS[name]), "caption": CAPTIONS[name]}
                  for name in figures],

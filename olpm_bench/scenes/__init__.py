@@ -121,18 +121,27 @@ def digest(name_or_path: str | Path, changes: dict[str, Any] | None = None) -> s
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+class _AsMitsuba(ElementTree.TreeBuilder):
+    """Refuses what Mitsuba's own parser passes over: then both have read the same."""
+
+    def doctype(self, *_: str | None) -> None:
+        raise SceneError("has a DOCTYPE, whose entities and values of attributes Mitsuba would leave out; write the file without")
+
+
 def read_xml(path: Path) -> ElementTree.Element:
     """The root element of an XML file.
 
     Raises:
-        SceneError: a missing or unreadable file, or one that is not XML.
+        SceneError: a missing or unreadable file, one that is not XML, or one with a DOCTYPE.
     """
     if not (exists(path) and path.is_file()):
         raise SceneError(f"scene file {path}: there is no such file")
     try:
-        return ElementTree.parse(path).getroot()
+        return ElementTree.parse(path, ElementTree.XMLParser(target=_AsMitsuba())).getroot()
     except OSError as error:
         raise SceneError(f"scene file {path}: {error.strerror}") from error
+    except SceneError as error:
+        raise SceneError(f"scene file {path} {error}") from None
     except (ElementTree.ParseError, ValueError) as error:
         raise SceneError(f"scene file {path} is not well-formed XML: {error}") from error
 

@@ -15,7 +15,7 @@ from olpm_bench.transport import settings
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments"
 FILES = {file.name: tomllib.loads(file.read_text()) for file in sorted(FOLDER.glob("*.toml"))}
-SMALL_SECONDS = 150         # charged seconds of all cells of a small scale: with compilation about three minutes
+SMALL_SECONDS = 120         # charged seconds of all cells of a small scale: with compilation about three minutes
 
 
 def of_this_project(tmp_path: Path, name: str, scale: str | None = None) -> config.Experiment:
@@ -28,6 +28,11 @@ def of_this_project(tmp_path: Path, name: str, scale: str | None = None) -> conf
     return experiment_file.load(FOLDER / name, dict.fromkeys(scenes, tmp_path / "room.xml"), scale)
 
 
+def with_amounts(preset: settings.TrainingSettings, found: settings.TrainingSettings) -> settings.TrainingSettings:
+    """A preset with another's passes of particles, which files may choose."""
+    return dataclasses.replace(preset, **{key: getattr(found, key) for key in ("passes", "photons", "importons")})
+
+
 SCALES = [(name, scale) for name, table in FILES.items() for scale in (None, *table.get("scale", {}))]
 
 
@@ -36,7 +41,7 @@ def test_every_experiment_loads_at_every_scale(tmp_path, name, scale):
     """A dry run: nothing is loaded, compiled or rendered."""
     experiment = of_this_project(tmp_path, name, scale)
     plan = run.plan(experiment, tmp_path)
-    assert plan["cells"] == plan["todo"] and 0 < plan["gigabytes"] < 16
+    assert plan["cells"] == plan["todo"] and 0 < plan["gigabytes"] < 24
     if scale == "small" and plan["hours"] is not None:
         assert plan["hours"] * 3600 <= SMALL_SECONDS
     assert "small" in experiment.scale or scale
@@ -62,9 +67,8 @@ def test_the_talks_method_and_its_modern_version_stand_side_by_side(tmp_path, na
     assert plain.representation is None
     for method, preset in zip(guided, presets, strict=True):
         assert method.representation == {"type": "gaussian_mixture"}
-        wanted, found = settings.training(preset), experiment.training_of(method)
-        amounts = {key: getattr(found, key) for key in ("passes", "photons", "importons")}
-        assert found == dataclasses.replace(wanted, **amounts) and method.name == f"GMM, {preset}"
+        found = experiment.training_of(method)
+        assert found == with_amounts(settings.training(preset), found) and method.name == f"GMM, {preset}"
         assert experiment.integrator_of(scene, method) == settings.integrator(preset)
 
 
@@ -115,8 +119,10 @@ def test_the_ablation_leaves_out_one_addition_at_a_time(tmp_path):
     best, *others = ({**dataclasses.asdict(c.integrator), **dataclasses.asdict(c.training)} for c in
                      experiment.cells()[:len(experiment.method)])
     assert experiment.baseline_name == experiment.method[0].name == "best" and len(experiment.seeds) >= 8
-    for other in others:
-        assert sum(other[key] != best[key] for key in best) == 1
+    for method, other in zip(experiment.method[1:], others, strict=True):
+        together = {"camera_passes", "roulette"} if method.name == "no camera paths, no roulette" else set()
+        left_out = {key for key in best if other[key] != best[key]}
+        assert left_out == together or (len(left_out) == 1 and not together)
 
 
 def test_the_targets_compare_presets_with_plain_path_tracing(tmp_path):
@@ -126,7 +132,7 @@ def test_the_targets_compare_presets_with_plain_path_tracing(tmp_path):
         assert experiment.baseline_name == "Path tracing" and experiment.method[0].representation is None
         for method in experiment.method[1:]:
             preset = method.name.removeprefix("GMM, ") if method.name != "GMM" else "best"
-            assert experiment.training_of(method) == settings.training(preset)
+            assert with_amounts(settings.training(preset), experiment.training_of(method)) == experiment.training_of(method)
             assert experiment.integrator_of(experiment.scene[0], method) == settings.integrator(preset)
 
 

@@ -301,21 +301,23 @@ def test_a_zombie_holds_nothing(tmp_path):
     holder.communicate()
 
 
-def test_who_has_lost_a_cell_does_not_write_it(tmp_path, monkeypatch):
-    from olpm_bench.bench import run
+@pytest.mark.parametrize("name", ["run.measure", "results.write_exr"])
+def test_who_has_lost_a_cell_does_not_write_it(tmp_path, monkeypatch, name):
+    """Lost while it was measured, or while its images were written beside their place."""
+    from olpm_bench.bench import results, run
 
-    (tmp_path / "test.toml").write_text(BARE)
-    loaded, measure = experiment_file.load(tmp_path / "test.toml"), run.measure
-    folder = Results(tmp_path / "results" / "test").cell_folder("cornell_box", "Roulette", 1)
+    (tmp_path / "test.toml").write_text(SHORT)
+    folder = Results(tmp_path / "results" / "test").cell_folder("cornell_box", "Roulette", 0)
+    original = {"run.measure": run.measure, "results.write_exr": results.write_exr}[name]
 
-    def hangs(spec, *arguments, **options):
-        done = measure(spec, *arguments, **options)
-        if str(spec) == "cornell_box / Roulette / seed 1":
+    def hangs(what, *arguments, **options):
+        done = original(what, *arguments, **options)
+        if str(what) == "cornell_box / Roulette / seed 0" or folder in getattr(what, "parents", ()):
             (folder / "lock").write_bytes(lock._signed({**lock._identity(), "pid": 1}))       # of the thief
         return done
-    monkeypatch.setattr(run, "measure", hangs)
-    (problem,) = run.run(loaded, tmp_path / "results")
-    assert problem.startswith("cornell_box / Roulette / seed 1: ") and "was lost to another process" in problem
+    monkeypatch.setattr(f"olpm_bench.bench.{name}", hangs)
+    (problem,) = run.run(experiment_file.load(tmp_path / "test.toml"), tmp_path / "results")
+    assert problem.startswith("cornell_box / Roulette / seed 0: ") and "was lost to another process" in problem
     assert files_in(folder) == ["lock"]
 
 
@@ -395,7 +397,7 @@ INTERRUPT_AT = {"left": 0, "below": ""}
 
 def _interrupt(name: str, arguments: tuple) -> None:
     """An audit hook: raises KeyboardInterrupt at the event of that number below the folder."""
-    if INTERRUPT_AT["left"] > 0 and name in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir") \
+    if INTERRUPT_AT["left"] > 0 and name in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link") \
             and str(arguments[0]).startswith(INTERRUPT_AT["below"]):
         INTERRUPT_AT["left"] -= 1
         if INTERRUPT_AT["left"] == 0:

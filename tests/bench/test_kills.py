@@ -24,7 +24,7 @@ import psutil
 import pytest
 
 from olpm_bench.bench import experiment_file
-from olpm_bench.bench.results import Results
+from olpm_bench.bench.results import TRAINED, Results
 
 ROOT = Path(__file__).resolve().parents[2]
 KILLS = int(os.environ.get("OLPM_KILLS", "5"))
@@ -44,9 +44,10 @@ max_depth = 4
 reference = "none"
 [training]
 passes = 1
-photons = 2000
-importons = 1000
+photons = 20_000
+importons = 10_000
 camera_passes = 0
+record_radius = 0.2
 [[method]]
 name = "Path tracing"
 [[method]]
@@ -129,6 +130,8 @@ def undisturbed(tmp_path_factory) -> Run:
     run = Run(experiment, experiment.with_name("results"))
     assert not run.watch() and run.process.returncode == 0, run.errors
     assert len(complete(experiment, run.results)) == 4
+    mixtures = [Results(run.results / experiment.stem).read_cell("cornell_box", "GMM", seed) for seed in (0, 1)]
+    assert all(cell.info["trained"] > TRAINED for cell in mixtures), "the mixture guides few paths"
     return run
 
 

@@ -37,6 +37,21 @@ def test_a_foreign_reference_is_averaged_down_and_has_no_noise_floor(tmp_path):
         read_reference(tmp_path / "foreign.exr", 8, 5)
 
 
+HALVES = {name: image() for name in ("a.mean", "b.mean", "a.variance", "b.variance")}
+
+
+@pytest.mark.parametrize("changes, header, words", [
+    ({}, {}, "spp_a = None, must be the samples of a half"),
+    ({}, {"spp_a": 3, "spp_b": 0}, "spp_b = 0, must be"), ({}, {"spp_a": "3", "spp_b": 3}, "spp_a = '3', must be"),
+    ({}, {"spp_a": 10**400, "spp_b": 1}, "spp_a = 1000"),           # which NumPy would not take for a number
+    ({"a.mean": image()[..., 0]}, {"spp_a": 3, "spp_b": 1}, "no finite RGB part 'a.mean'"),
+    ({"b.variance": image()[..., 0]}, {"spp_a": 3, "spp_b": 1}, "no finite RGB part 'b.variance'")])
+def test_halves_that_another_program_has_saved_again_are_refused(tmp_path, changes, header, words):
+    write_exr(tmp_path / "saved.exr", HALVES | changes, header)
+    with pytest.raises(ResultError, match=rf"saved\.exr is broken: {words}.* another program may have written it"):
+        read_reference(tmp_path / "saved.exr", 7, 5)
+
+
 def test_a_broken_reference_says_what_to_do(tmp_path):
     write_reference(tmp_path / "k", Reference(image(), image(), image(), image(), {"spp_a": 1, "spp_b": 1}))
     with pytest.raises(ResultError, match=r"is 7x5, the experiment's image is 8x5"):

@@ -12,7 +12,7 @@ import pytest
 
 from olpm_bench.bench import experiment_file, run
 from olpm_bench.bench.config import Experiment
-from olpm_bench.bench.results import Results
+from olpm_bench.bench.results import TRAINED, Results
 
 TOML = """
 title = "Repeatable"
@@ -57,14 +57,15 @@ name = "Hey"
 representation = { type = "hey" }
 """
 
-# A floor lit by eight cubes.  Which of them next-event estimation samples goes by their order: that of the file, unless a loader
+# A room lit by eight cubes.  Which of them next-event estimation samples goes by their order: that of the file, unless a loader
 # puts together meshes whose materials are the same, of which there are three here.
 LAMP = """<shape type="cube"><transform name="to_world"><scale value="0.1"/><translate x="{x}" y="{y}" z="1"/></transform>
   <bsdf type="{bsdf}"/><emitter type="area"><rgb name="radiance" value="{radiance}, 2, 1"/></emitter></shape>"""
 SCENE = """<scene version="3.0.0">
   <sensor type="perspective"><transform name="to_world">
     <lookat origin="0, -4, 3" target="0, 0, 0.3" up="0, 0, 1"/></transform></sensor>
-  <shape type="rectangle"><transform name="to_world"><scale value="3"/></transform></shape>
+  <shape type="cube"><transform name="to_world"><scale value="5"/><translate x="0" y="0" z="5"/></transform>
+    <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>
   <shape type="sphere"><point name="center" x="0.3" y="0" z="0.4"/><float name="radius" value="0.4"/></shape>""" + "".join(
     LAMP.format(x=i % 4 - 1.5, y=i // 4, bsdf=("diffuse", "plastic", "conductor")[i % 3], radiance=i + 1) for i in range(8)
 ) + "</scene>"
@@ -91,8 +92,8 @@ def test_images_repeat_in_another_process_on_other_threads_and_resumed(tmp_path:
         if cell.seed == 1:
             (Results(root / "test").cell_folder(cell.scene.name, cell.method.name, cell.seed) / "cell.json").unlink()
     environment = {**os.environ, "PYTHONHASHSEED": "5", "PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([sys.executable, "-c", CHILD, tmp_path / "test.toml", root, str(dr.thread_count() + 1)], env=environment,
-                   check=True, capture_output=True, text=True)
+    subprocess.run([sys.executable, "-c", CHILD, tmp_path / "test.toml", root, "1" if dr.thread_count() > 1 else "2"],
+                   env=environment, check=True, capture_output=True, text=True)
     for (where, before), after in zip(images.items(), _images(experiment, root).values(), strict=True):
         assert np.isfinite(before).all() and before.mean() > 0.01
         np.testing.assert_array_equal(before, after, err_msg=where)
@@ -101,4 +102,5 @@ def test_images_repeat_in_another_process_on_other_threads_and_resumed(tmp_path:
 def _images(experiment: Experiment, root: Path) -> dict[str, np.ndarray]:
     cells = [Results(root / "test").verified_cell(c.scene.name, c.method.name, c.seed) for c in experiment.cells()]
     assert all(cells)
+    assert all(cell.info["trained"] is None or cell.info["trained"] > TRAINED for cell in cells), "guides that guide few paths"
     return {f"{cell.scene}, {cell.method}, seed {cell.seed}": cell.image()["mean"] for cell in cells}

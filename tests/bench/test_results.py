@@ -58,6 +58,30 @@ def test_what_is_missing_or_broken_is_named(tmp_path):
     assert results.verified_cell(*names) is not None
 
 
+@pytest.mark.parametrize("name", ["image.exr", "checkpoints.exr", "trace.jsonl"])
+def test_a_whole_file_of_another_cell_is_not_believed(tmp_path, name):
+    results = Results(tmp_path)
+    files = [write_cell(results, seed=seed, checkpoints=2 + seed).folder / name for seed in (0, 1)]
+    swapped = [file.read_bytes() for file in reversed(files)]
+    for seed, (file, content) in enumerate(zip(files, swapped, strict=True)):
+        file.write_bytes(content)
+        with pytest.raises(ResultError, match=rf"{seed}/{name} is broken: its digest is another"):
+            results.read_cell("a scene", "GMM, K = 8", seed)
+
+
+def test_cells_of_older_versions_have_no_digests_of_images_and_those_must_be_of_the_right_size(tmp_path):
+    results, names = Results(tmp_path), ("a scene", "GMM, K = 8", 0)
+    folder = write_cell(results).folder
+    info = json.loads((folder / "cell.json").read_text())
+    older = {name: info["digests"][name] for name in ("cell.json", "trace.jsonl")}
+    for digests in (older, {}):
+        write_json(folder / "cell.json", info | {"digests": digests})
+        assert results.verified_cell(*names, (5, 7)) is not None
+        for read in (lambda cell: cell.image(), lambda cell: cell.checkpoints()):
+            with pytest.raises(ResultError, match=r"\.exr is broken: 7x5 pixels in place of 7x6"):
+                read(results.read_cell(*names, (6, 7)))
+
+
 def test_a_checkpoint_too_few_is_noticed(tmp_path):
     cell = write_cell(Results(tmp_path), checkpoints=3)
     trace = cell.folder / "trace.jsonl"

@@ -4,6 +4,7 @@ Images are tiny and budgets in samples, so that nothing depends on the speed of 
 """
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from olpm_bench.bench.files import ResultError, require_inside
 from olpm_bench.bench.lock import locked
 from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.bench.results import Results
+from olpm_bench.transport import settings
 from olpm_bench.transport.settings import InputError
 
 
@@ -97,6 +99,16 @@ def test_changed_broken_and_missing_cells_are_redone(experiment, root, monkeypat
     assert [c.info["key"] for c in cells(experiment, root)] == [c.key for c in experiment.cells()]
 
 
+def test_cells_with_the_images_of_other_seeds_are_redone(experiment, root, monkeypatch):
+    run.run(experiment, root)
+    images = [cell.folder / "image.exr" for cell in cells(experiment, root) if cell.method == "Path tracing"]
+    whole = [image.read_bytes() for image in images]
+    for image, content in zip(images, reversed(whole), strict=True):
+        image.write_bytes(content)
+    monkeypatch.setattr(run, "measure", counted := Counted())
+    assert run.run(experiment, root) == [] and counted.calls == 2 and [image.read_bytes() for image in images] == whole
+
+
 def interrupted_while_tracing(by: BaseException) -> RuntimeError:
     error = RuntimeError("dr.while_loop(): encountered an exception (see above).")
     error.__cause__ = by
@@ -119,7 +131,8 @@ def test_an_interruption_loses_the_cell_in_hand_only(experiment, root, monkeypat
 
 
 @pytest.mark.parametrize("error", [CellFailedError("3 pixels are NaN"), RuntimeError("jit:\n failure"),
-                                   InputError("the records take about 9 GB, and 3 GB are free: fewer of them")])
+                                   InputError("the records take about 9 GB, and 3 GB are free: fewer of them"),
+                                   MemoryError("Unable to allocate 8 PiB")])
 def test_a_failed_cell_is_named_and_the_others_are_run(experiment, root, monkeypatch, error):
     monkeypatch.setattr(run, "measure", Counted(fail_at=2, error=error))
     problems = run.run(experiment, root)
@@ -128,6 +141,22 @@ def test_a_failed_cell_is_named_and_the_others_are_run(experiment, root, monkeyp
     assert [c is not None for c in cells(experiment, root)] == [True, False, True, True]
     failed = Results(root / "test").cell_folder("cornell_box", "Roulette", 0) / "failed.json"
     assert json.loads(failed.read_text())["reason"] == reason
+
+
+def test_errors_of_other_peoples_code_fail_its_cells_and_our_own_end_the_run(experiment, root, tmp_path, monkeypatch):
+    code = "class Theirs:\n    def init(self, n_records, seed=0, parallax=False):\n        return {}['x']\n"
+    (tmp_path / "theirs.py").write_text(code)
+    theirs = f'[[method]]\nname = "Theirs"\nrepresentation = {{ type = "{tmp_path}/theirs.py:Theirs" }}\n'
+    experiment.path.write_text(TOML + theirs)
+    loaded = experiment_file.load(experiment.path)
+    assert run.run(loaded, root) == [f"cornell_box / Theirs / seed {seed}: KeyError: 'x'" for seed in (0, 1)]
+    assert [c is not None for c in cells(loaded, root)] == [True, True, False] * 2
+    failed = Results(root / "test").cell_folder("cornell_box", "Theirs", 1) / "failed.json"
+    assert json.loads(failed.read_text())["reason"] == "KeyError: 'x'"
+    cells(experiment, root)[0].folder.joinpath("cell.json").unlink()
+    monkeypatch.setattr(run, "measure", Counted(fail_at=1, error=KeyError("x")))
+    with pytest.raises(KeyError):
+        run.run(experiment, root)
 
 
 def test_a_cell_in_other_hands_is_left_alone(experiment, root):
@@ -178,6 +207,21 @@ def test_a_plan_counts_what_is_left(experiment, root):
     assert run.plan(experiment, root)["todo"] == []
     experiment.path.write_text(TOML.replace("spp = 11", "seconds = 900"))
     assert run.plan(experiment_file.load(experiment.path), root)["hours"] == 1.0
+
+
+@pytest.mark.parametrize("preset, schedule", [("best", "interleaved"), ("paper2014", "single_batch")])
+def test_the_memory_of_ten_million_photons(experiment, preset, schedule):
+    """At most: closed rooms keep 11 hits of each, splitting twice as many; a gather of the nearest takes 130 bytes a hit."""
+    plain = dataclasses.replace(experiment.cells()[0], integrator=settings.integrator(max_depth=13))
+
+    def memory(**changes) -> float:
+        changes = {"schedule": schedule, "passes": 1, "importons": 0, "camera_passes": 0, **changes}
+        return run.memory(dataclasses.replace(plain, training=settings.training(preset, **changes)))
+    assert 12 < memory(photons=10**7) < 24
+    assert memory(photons=10**6) == pytest.approx(0.9 * run.memory(plain) + 0.1 * memory(photons=10**7))
+    at_once, of_both = (10**7, 10**6) if schedule == "single_batch" else (10**6, 2 * 10**6)
+    assert memory(photons=10**6, passes=10) == memory(photons=at_once) and memory(passes=0) == run.memory(plain)
+    assert memory(photons=10**6, importons=10**6) == memory(photons=of_both)
 
 
 def test_the_committed_references_are_found(experiment, tmp_path, root):

@@ -75,11 +75,24 @@ def test_an_array_names_the_scenes_and_methods_that_stay(tmp_path):
     assert (one.training_of(one.method[0]).photons, one.training_of(one.method[0]).neighbours) == (500, 20)
 
 
-def test_crops_are_of_one_size_of_the_image():
-    data = {"scene": [{"name": "a", "width": 4, "crops": [[0, 0, 2, 2]]}], "scale": {
-        "small": {"scene": {"width": 2}}, "other": {"scene": {"width": 2, "crops": [[0, 0, 1, 1]]}}, "noisy": {"seeds": 1}}}
+def test_crops_change_with_the_size_of_the_image():
+    own = {"crops": [[0, 0, 1, 1]]}
+    data = {"scene": [{"name": "a", "width": 96, "height": 54, "crops": [[30, 29, 24, 14], [60, 4, 24, 14]]}], "scale": {
+        "small": {"scene": {"width": 48, "height": 27}}, "tiny": {"scene": {"width": 16, "height": 9}},
+        "large": {"scene": {"width": 192, "height": 108}}, "odd": {"scene": {"width": 64, "height": 36}},
+        "narrow": {"scene": {"width": 48}}, "other": {"scene": {"width": 48, "height": 27, **own}}, "noisy": {"seeds": 1},
+        "broken": {"scene": {"width": "48", "height": 0}}}}
     crops = {name: scale.scaled(data, name, "a.toml")["scene"][0].get("crops") for name in data["scale"]}
-    assert crops == {"small": None, "other": [[0, 0, 1, 1]], "noisy": [[0, 0, 2, 2]]}
+    assert crops == {"small": [[15, 14, 12, 7], [30, 2, 12, 7]], "tiny": [[5, 5, 4, 4], [10, 1, 4, 4]],
+                     "large": [[60, 58, 48, 28], [120, 8, 48, 28]], "odd": [], "narrow": [], "other": own["crops"],
+                     "noisy": data["scene"][0]["crops"], "broken": []}
+
+
+@pytest.mark.parametrize("boxes", [[[0, 0, 24, 14], [0, 0, 12, 7]], [[0, 0, 24]], [["a", 0, 24, 14]], [[0, 0, 24.0, 14]], [3], 3])
+def test_crops_that_fit_no_other_size_are_left_out(boxes):
+    """12 x 7 and 6 x 3.5 pixels are not of one shape when rounded; the rest would be complained of at the size that it is for."""
+    data = {"scene": [{"width": 96, "height": 54, "crops": boxes}], "scale": {"small": {"scene": {"width": 48, "height": 27}}}}
+    assert scale.scaled(data, "small", "a.toml")["scene"][0]["crops"] == []
 
 
 def test_a_scale_has_results_and_commands_of_its_own(tmp_path):

@@ -90,6 +90,20 @@ def test_speed_up_only_where_both_curves_reach_the_error():
         statistics.speed_up(slow, curve(1, 2, 3))
 
 
+def test_the_worst_speed_up_is_where_a_method_has_just_begun():
+    """One that trains for 3 s and then converges four times as fast is down to an error e after 3 + 4 / e^2 s, path tracing
+    after 16 / e^2: for e = 2, where it begins, both after 4 s, for e = 1, where path tracing ends, after 7 and 16 s."""
+    slow, at = curve(4), np.geomspace(4, 16, 65)
+    fast = statistics.Curve(at, converging(2, at - 3)[None])
+    assert statistics.worst_speed_up(slow, fast) == pytest.approx(1, rel=1e-6)
+    assert statistics.worst_speed_up(fast, slow) == pytest.approx(7 / 16, rel=0.01)
+    late = statistics.Curve(np.array([15.5, 16]), np.array([[3.9, 2]]))
+    assert statistics.worst_speed_up(slow, late) == pytest.approx((4 / 3.9) ** 2 / 15.5, rel=1e-6)
+    assert statistics.worst_speed_up(slow, slow) == 1
+    assert np.isnan(statistics.worst_speed_up(slow, curve(40)))                 # which ends at 10, and slow begins at 4
+    assert np.isnan(statistics.worst_speed_up(slow, curve(0.4)))
+
+
 def test_a_speed_up_that_a_seed_less_leaves_unmeasured_has_no_interval():
     """Without the slowest of its seeds the fast curve starts below the error: the speed-up is more than its first time says."""
     slow, fast = curve(3.8, 3.9, 4, 4.1, 4.2), curve(2.3, 2.4, 2.6, 2.7, 2.8)

@@ -204,13 +204,31 @@ def test_what_cannot_be_submitted(experiment, tmp_path, monkeypatch, options, wo
     assert not list((tmp_path).rglob("cell.json"))
 
 
-def test_slurm_gets_an_array_of_whole_nodes_of_one_model(experiment, tmp_path, monkeypatch):
-    tools, results = tmp_path / "bin", tmp_path / "results"
-    tools.mkdir()
+@pytest.fixture
+def slurm(tmp_path, monkeypatch) -> None:
+    """Commands of Slurm that keep what is asked for, as the file `asked`."""
+    (tools := tmp_path / "bin").mkdir()
     for name, script in (("srun", "exit 1"), ("sbatch", f'cp "$1" {tmp_path}/asked; echo "Submitted batch job 42"')):
         (tools / name).write_text(f"#!/bin/sh\n{script}\n")
         (tools / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tools}:{os.environ['PATH']}")
+
+
+@pytest.mark.usefixtures("slurm")
+def test_timed_cells_on_any_model_of_slurms_nodes_are_warned_of(experiment, tmp_path):
+    submit = ("submit", experiment, "--results", tmp_path / "results", "--workers", 2)
+    assert "CPU" not in call(*submit).stderr                # a budget in samples
+    experiment.write_text(TOML.replace("spp = 2000", "seconds = 5"))
+    assert "CPU" not in call(*submit, "--constraint", "epyc7763").stderr
+    warned = call(*submit)
+    line, = (line for line in warned.stderr.splitlines() if "different CPU models" in line)
+    assert line.startswith("olpm-bench: the budget of shared.toml is in seconds, and without --constraint its cells may land on")
+    assert warned.exit_code == 0, warned.output
+
+
+@pytest.mark.usefixtures("slurm")
+def test_slurm_gets_an_array_of_whole_nodes_of_one_model(experiment, tmp_path):
+    results = tmp_path / "results"
     result = call("submit", experiment, "--results", results, "--workers", 3, "--constraint", "epyc7763", "--minutes", 90)
     assert result.exit_code == 0, result.output
     assert "submitted: 42_0, 42_1, 42_2" in result.stdout

@@ -19,7 +19,7 @@ from olpm_bench.transport.settings import IntegratorSettings
 KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "mape", "smape", "relmse", "relmse_trimmed", "flip", "ssim_error",
         "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "charged_seconds", "overrun",
         "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
-        "bytes_per_record", "particles"]
+        "bytes_per_record", "particles", "worst_speed_up", "warnings"]
 ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
 TIMES = [1.0, 4.0, 16.0]
 
@@ -103,7 +103,7 @@ def without_reference(known, **changes) -> SimpleNamespace:
 def test_a_scene_without_reference_has_no_errors_but_all_the_rest(known):
     rows, expected = summarised(without_reference(known))["rows"], summarised(known)["rows"]
     for row, full in zip(rows, expected, strict=True):
-        errors = KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1]
+        errors = [*KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1], "worst_speed_up"]
         assert [row[key] for key in errors] == [None] * len(errors)
         assert {k: v for k, v in row.items() if k not in errors} == {k: v for k, v in full.items() if k not in errors}
     assert finished.read(without_reference(known).experiment, known.results, {}).speed_ups == {"Fast": {}}
@@ -127,6 +127,33 @@ def test_cells_that_exceed_their_budget_are_named(known, capsys):
     result["rows"][1]["overrun"] = 0.4
     summary.print_table(result)
     assert "door_ajar / Fast: took 40% more time than its budget" in capsys.readouterr().out
+
+
+def test_warnings_of_training_are_told_once_with_every_table(known):
+    """Of each method, and not only while its cells run; and the least share of records that guide."""
+    found = finished.read(known.experiment, known.results, known.references)
+    for cell, trained in zip(found.scenes[0].cells["Fast"], (0.9, 0.31, 0.4), strict=True):
+        cell.info |= {"warnings": ["no camera path has met light"], "trained": trained}
+    for cell in found.scenes[0].cells["Slow"]:
+        cell.info |= {"warnings": [], "trained": None}
+    result = summary.summarise(found)
+    slow, fast = (row["warnings"] for row in result["rows"])
+    assert slow == [] and fast[0] == "no camera path has met light" and len(fast) == 2
+    assert fast[1].startswith("only 31% of the surfaces that the camera sees have records ")
+    for show in (summary.print_table, summary.print_metrics):
+        console = Console(file=io.StringIO())
+        show(result, console)
+        for warning in fast:
+            assert console.file.getvalue().count(f"door_ajar / Fast: {warning}\n") == 1
+
+
+def test_who_is_slower_to_some_error_is_named(known):
+    rows = summarised(known)["rows"]
+    assert [row["worst_speed_up"] for row in rows] == pytest.approx([1, 4], rel=1e-4)
+    assert not [note for note in summary.notes(rows) if "compares worst" in note]
+    known.experiment = known.experiment.model_copy(update={"baseline": "Fast"})
+    rows = summarised(known)["rows"]
+    assert "door_ajar / Slow: 0.25x as fast as the baseline to the L1 error where it compares worst" in summary.notes(rows)
 
 
 def test_gains_and_speed_ups_are_over_the_baseline(known):

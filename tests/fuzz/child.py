@@ -96,7 +96,7 @@ def load(kind: str, path: str) -> None:
     elif kind == "directions":
         fit._load(Path(path), "wo", "weight", "pdf")
     elif kind == "image":
-        read_reference(Path(path), 8, 6)
+        assert read_reference(Path(path), 8, 6).mean.shape == (6, 8, 3)
         compare._read(Path(path))
     else:
         guide = Guide.load(path)

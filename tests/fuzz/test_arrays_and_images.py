@@ -32,6 +32,7 @@ def process():
 
 GUIDES = {"jensen": {"type": "jensen", "resolution": 2}, "hey": {"type": "hey", "cones": 4},
           "gaussian_mixture": {"type": "gaussian_mixture", "components": 2}}        # all but the first with parallax
+HALVES = ("a.mean", "b.mean", "a.variance", "b.variance")       # of a reference
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +54,13 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     wo = rng.normal(size=(20, 3)) * (1, 1, 0) + (0, 0, 3)
     np.savez(folder / "directions.npz", wo=wo / np.linalg.norm(wo, axis=1, keepdims=True), weight=np.ones(20), pdf=np.ones(20))
     write_exr(folder / "image.exr", {"mean": rng.uniform(size=(6, 8, 3)).astype(np.float32), "count": np.ones((6, 8))}, {"a": 1})
+    write_exr(folder / "halves.exr", {name: rng.uniform(size=(6, 8, 3)) for name in HALVES}, {"spp_a": 1, "spp_b": 2})
     return {file.stem: file.read_bytes() for file in folder.iterdir()}
 
 
 def judge(process, folder: Path, kind: str, content: bytes) -> str:
     """The file read by the child; returns whether it was whole."""
+    kind = "image" if kind == "halves" else kind
     file = folder / f"broken.{'exr' if kind == 'image' else 'npz'}"
     file.write_bytes(content)
     answer = process.ask(kind, str(file))
@@ -133,9 +136,16 @@ def test_directions_whose_arrays_are_broken(process, valid, tmp_path_factory, da
 
 
 @examples(0.1)
-@given(data=st.data())
-def test_images_whose_bytes_are_broken(process, valid, tmp_path_factory, data):
-    judge(process, tmp_path_factory.getbasetemp(), "image", data.draw(mutated_bytes(valid["image"])))
+@given(data=st.data(), name=st.sampled_from(["image", "halves"]))
+def test_images_whose_bytes_are_broken(process, valid, tmp_path_factory, data, name):
+    judge(process, tmp_path_factory.getbasetemp(), name, data.draw(mutated_bytes(valid[name])))
+
+
+@pytest.mark.parametrize("channels, header", [(3, {}), (3, {"spp_a": 0, "spp_b": 0}), (1, {"spp_a": 1, "spp_b": 1})])
+def test_halves_of_a_reference_that_another_program_has_saved_again(process, tmp_path, channels, header):
+    shape = (6, 8, 3)[:2 + channels // 3]
+    write_exr(tmp_path / "halves.exr", {name: np.ones(shape, np.float32) for name in HALVES}, header)
+    assert judge(process, tmp_path, "halves", (tmp_path / "halves.exr").read_bytes()) == "refused"
 
 
 def test_what_is_whole_is_read(process, valid, tmp_path):

@@ -13,7 +13,7 @@ import pytest
 import tomli_w
 from typer.testing import CliRunner
 
-from olpm_bench.bench import experiment_file
+from olpm_bench.bench import environment, experiment_file
 from olpm_bench.cli import app
 from olpm_bench.scenes import SceneError
 from olpm_bench.scenes.load import load
@@ -153,6 +153,27 @@ def test_a_library_is_not_loaded_as_a_representation(tmp_path, library):
         with pytest.raises(InputError, match="unknown representation"):
             experiment_file.load(experiment(tmp_path, kind))
     assert not (tmp_path / "RAN").exists()
+
+
+def test_git_is_not_asked_about_the_current_folder(tmp_path, monkeypatch):
+    """Where the software is installed, and the current folder is somebody's clone with a program to watch files."""
+    if shutil.which("git") is None:
+        pytest.skip("needs git")
+    (tmp_path / "olpm_bench").mkdir()
+    (evil := tmp_path / "evil.sh").write_text(f"#!/bin/sh\ntouch {tmp_path / 'RAN'}\n")
+    evil.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+
+    def git(*words: str) -> None:
+        subprocess.run(["git", *words], check=True, capture_output=True)
+    for words in (["init"], ["add", evil.name], ["config", "core.fsmonitor", str(evil)], ["status"]):
+        git(*words)
+    if not (tmp_path / "RAN").exists():
+        pytest.skip("this git runs no such program")
+    (tmp_path / "RAN").unlink()
+    installed = tmp_path / "site-packages" / "olpm_bench" / "bench" / "environment.py"
+    monkeypatch.setattr(environment, "__file__", str(installed))
+    assert environment.commit() is None and not (tmp_path / "RAN").exists()
 
 
 def test_results_stay_in_their_folder_and_links_in_it_are_replaced(tmp_path, monkeypatch):

@@ -77,6 +77,15 @@ def test_the_page_holds_the_numbers_the_configuration_and_the_machine(finished):
     assert "Quick & dirty" not in text.replace("\\u0026", "&amp;")
 
 
+def test_warnings_of_training_stand_below_the_table(finished):
+    assert '<ul class="caption" id="notes">' not in written(finished)
+    for cell in finished.scenes[0].cells["Quick & dirty"]:
+        cell.info["warnings"] = ["no camera path has met light: it may not enter <what> the camera sees"]
+    text = written(finished)
+    note = "<li>door_ajar / Quick &amp; dirty: no camera path has met light: it may not enter &lt;what&gt; the camera sees</li>"
+    assert text.count(note) == 1 and text.index("</table>") < text.index(note) < text.index('<dl class="legend">')
+
+
 def decoded(book: dict, index: int) -> np.ndarray:
     kind = {"single": np.float32, "rgbe": np.uint8}[book["types"][index]]
     raw = np.frombuffer(base64.b64decode(book["dataUrls"][index].partition(",")[2]), kind)

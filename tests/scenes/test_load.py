@@ -141,6 +141,7 @@ FOGGY = SHAPE.replace("</shape>", FOG.format(".5, .5, .5") + "</shape>")
     ((SENSOR, SHAPE, EMITTER, "<foo/>"), "foo"),
     ((SENSOR, SHAPE, '<emitter type="nonesuch"/>'), "nonesuch"),
     ((SENSOR, SHAPE, "<emitter"), "not well-formed XML"),
+    ((SENSOR, SHAPE, '<emitter type="&sky;"/>'), "not well-formed XML: undefined entity"),
     ((SENSOR, '<shape type="obj"><string name="filename" value="no.obj"/></shape>', EMITTER), "no.obj"),
     ((SENSOR, SHAPE, EMITTER, '<include filename="no.xml"/>'), "no.xml: there is no such file"),
     ((SENSOR.replace("30", "0"), SHAPE, EMITTER), "height = 0: must be"),
@@ -150,6 +151,18 @@ def test_unusable_files(tmp_path: Path, parts: tuple, message: str):
         load(xml(tmp_path, *parts))
     assert "\n" not in str(error.value)
     assert "scene.xml" in str(error.value) or "height" in str(error.value) or "no.xml" in str(error.value)
+
+
+@pytest.mark.parametrize("declared", ["", ' SYSTEM "scene.dtd"', ' [<!ENTITY sky "constant">]',
+                                      ' [<!ATTLIST shape type CDATA "sphere">]'])
+def test_a_doctype_is_refused_as_mitsuba_passes_over_what_it_declares(tmp_path: Path, declared: str):
+    file = xml(tmp_path, SENSOR, SHAPE, EMITTER, name="part.xml")
+    file.write_text(f"<!DOCTYPE scene{declared}>{file.read_text()}")
+    whole = xml(tmp_path, '<include filename="part.xml"/>')
+    for read in (load, scenes.digest):
+        for path in (file, whole):
+            with pytest.raises(SceneError, match=r"scene file \S*part\.xml has a DOCTYPE, .*; write the file without$"):
+                read(path)
 
 
 @pytest.mark.parametrize("arguments, message", [
