@@ -245,21 +245,18 @@ def test_the_gate_fails_when_a_claim_is_turned_round_and_when_the_guide_learns_g
 
 
 @pytest.mark.slow
-def test_the_gate_of_this_project_refuses_garbage_and_its_claim_turned_round(tmp_path):
-    """experiments/gate.toml with a quarter of its pixels and camera paths, against histograms only, whose cells serve twice: a
-    mixture that learns from random directions, and the mixture as it is, claimed to be worse."""
+def test_the_gate_of_this_project_refuses_garbage(tmp_path):
+    """experiments/gate.toml with a quarter of its pixels and camera paths, and a mixture that learns from random directions,
+    against histograms only."""
     text = (ROOT / "experiments" / "gate.toml").read_text()
     for whole, part in (("width = 96", "width = 48"), ("height = 54", "height = 27"), ("32_768", "8_192")):
         assert whole in text
         text = text.replace(whole, part)
     first, _, rest = text.partition('[[method]]\nname = "Hey"')
     rest = rest[rest.index("[[method]]"):].partition('[[claim]]\nbetter = "GMM"\nworse = "Hey"')[0]
-    claim, turned = ('better = "{}"\nworse = "{}"'.format(*names) for names in (("GMM", "Jensen"), ("Jensen", "GMM")))
-    assert rest.count(claim) == 1
     (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments" / "gate.toml").write_text(first + rest.replace("gaussian_mixture", GARBAGE))
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "references").symlink_to(ROOT / "results" / "references")
-    for change in (("gaussian_mixture", GARBAGE), (claim, turned)):
-        (tmp_path / "experiments" / "gate.toml").write_text(first + rest.replace(*change))
-        result = call(tmp_path / "experiments" / "gate.toml", "--results", tmp_path / "results")
-        assert result.exit_code == 1 and result.stdout.count("FAILS") == 1 and "holds" not in result.stdout, result.output
+    result = call(tmp_path / "experiments" / "gate.toml", "--results", tmp_path / "results")
+    assert result.exit_code == 1 and result.stdout.count("FAILS") == 1 and "holds" not in result.stdout, result.output
