@@ -34,7 +34,7 @@ from olpm_bench.transport.settings import InputError, IntegratorSettings, Traini
 from olpm_bench.transport.view import records_seen
 from olpm_bench.transport.window import by_contribution
 
-LITTLE = 0.05       # of what the camera sees, that is guided, is told
+LITTLE = 0.05       # share of what the camera sees that is guided, below which `train` warns
 SETTLE = 3          # gathers from which the records of a single batch find their radii, as on-line in as many passes
 
 
