@@ -53,7 +53,8 @@ def register() -> None:
 
 
 def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixture", *, max_depth: int = 13, seed: int = 0,
-          preset: str = "best", integrator: dict[str, Any] | None = None, **settings: Any) -> Guide:
+          preset: str = "best", integrator: dict[str, Any] | None = None, sensor: mi.Sensor | None = None,
+          **settings: Any) -> Guide:
     """Train a guide on a scene.
 
     Args:
@@ -62,6 +63,8 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
         preset, settings: of `olpm_bench.transport.settings.TrainingSettings`: passes, photons, importons, gather, ...  All passes
             are done: `share`, `blend` and `while_rendering` concern the budgets of `olpm-bench run` only.
         integrator: of `IntegratorSettings`, for the passes of camera paths: roulette, fraction, ...
+        sensor: the camera from which importons and camera paths start, and whose pixels the roulette weighs paths for; the
+            scene's first by default.  The guide is right for others, too, but not made for them.
 
     Returns:
         A guide, which can be saved, loaded (`olpm_bench.transport.guide.Guide.load`) and handed to :func:`integrator`.
@@ -70,7 +73,7 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
     from olpm_bench.transport import settings as options
     from olpm_bench.transport import training
     return training.train(scene, representation, options.training(preset, **settings),
-                          options.integrator(preset, max_depth=max_depth, **integrator or {}), seed=seed)
+                          options.integrator(preset, max_depth=max_depth, **integrator or {}), seed=seed, sensor=sensor)
 
 
 def integrator(guide: Guide | None = None, preset: str = "best", **settings: Any) -> GuidedPathIntegrator:

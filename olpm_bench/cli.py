@@ -324,10 +324,13 @@ def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedd
     environment.select_variant(threads)
     from olpm_bench.bench import render_one
     from olpm_bench.bench.files import plain
+    from olpm_bench.bench.results import warnings
 
     spec = render_one.cell(scene, method, set_, seconds=seconds, spp=spp, width=width, height=height,
                            max_depth=max_depth, seed=seed, load_guide=load_guide)
     done = render_one.render(spec, out, save_guide=save_guide, load_guide=load_guide, records_map=records_map)
+    for warning in warnings([done]):
+        print(f"olpm-bench: {warning}", file=sys.stderr)
     print(json.dumps(plain(done), allow_nan=False))
 
 
@@ -336,8 +339,10 @@ def inspect(run: Annotated[Path, typer.Argument(metavar="RUN", help="An experime
                                                 show_default=False)],
             pixel: Annotated[list[str], typer.Option(metavar="X,Y", help="From the top left; can be given again.",
                                                      show_default=False)],
-            scene: Annotated[str | None, typer.Option(metavar="NAME[=PATH]", help="Which scene, and where its file is.",
-                                                      show_default=False)] = None,
+            scene: Annotated[list[str], typer.Option(metavar="NAME[=PATH]", help="Which scene, and where its file is; after the "
+                                                     "first, where those of others are.", show_default=False)] = [],  # noqa: B006
+            method: Annotated[list[str], typer.Option(metavar="NAME", help="Which methods; by default all, or of a sweep the "
+                                                      "last where they are many.", show_default=False)] = [],  # noqa: B006
             seed: Annotated[int | None, typer.Option(min=0, max=MAX_SEED, show_default=False, help="Of the training; the "
                                                      "experiment's first by default.")] = None,
             vertex: Annotated[int | None, typer.Option(min=1, help="Of a path from that pixel; the first that is not specular by "
@@ -349,14 +354,14 @@ def inspect(run: Annotated[Path, typer.Argument(metavar="RUN", help="An experime
     """Show what guides have learnt where a pixel looks: their densities, particles and records beside the truth."""
     from olpm_bench.bench import environment
 
-    name, _, file = (scene or "").partition("=")
+    name = scene[0].partition("=")[0] if scene else None
     pixels, guides = [_pixel(text) for text in pixel], dict(_named_file(text, "--guide") for text in guide)
-    loaded, folder = _load_run(run, results, [f"{name}={file}"] if file else [], scale)
+    loaded, folder = _load_run(run, results, [s for s in scene if "=" in s], scale)
     environment.select_variant()
     from olpm_bench.bench import inspect as inspector
 
-    written = inspector.inspect(loaded, folder, pixels, scene=name or None, seed=seed,
-                                number=vertex, path_seed=path_seed, passes=passes, guides=guides)
+    written = inspector.inspect(loaded, folder, pixels, scene=name, methods=method, seed=seed, number=vertex,
+                                path_seed=path_seed, passes=passes, guides=guides)
     for path in written:
         print(path)
 

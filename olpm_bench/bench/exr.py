@@ -11,6 +11,10 @@ from typing import Any
 import numpy as np
 
 from olpm_bench.bench.files import ResultError, digest, plain, replacing
+from olpm_bench.transport import headroom
+from olpm_bench.transport.settings import InputError
+
+COPIES = 3              # of images that are read: OpenEXR's, those in float32, and what is made of them
 
 
 def write_exr(path: Path, parts: dict[str, np.ndarray], header: dict[str, Any] | None = None) -> None:
@@ -49,17 +53,27 @@ def _digest_of_exr(parts: dict[str, np.ndarray], header: str) -> str:
                                      for piece in (name.encode(), str(image.shape[:2]).encode(), image.tobytes())))
 
 
+def _bytes_of(header: dict[str, Any]) -> int:
+    """Of the pixels of a part, when they are float32."""
+    first, last = header["dataWindow"]
+    width, height = (int(b) - int(a) + 1 for a, b in zip(first, last, strict=True))
+    return width * height * len(header["channels"]) * 4
+
+
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """All parts, (h, w, 3) or (h, w, 1) float32, and the JSON of `write_exr`.
 
     Raises:
         ResultError: missing or broken; of a file with a digest, whatever in it has changed.
+        InputError: its images take more memory than is free.
     """
     import OpenEXR
 
     if not path.is_file():
         raise ResultError(f"{path}: there is no such file")
     try:
+        size = sum(_bytes_of(part.header) for part in OpenEXR.File(str(path), header_only=True).parts)
+        headroom.require(COPIES * size, f"{path}: its images", "it can only be read where there is more")
         exr = OpenEXR.File(str(path))
         parts, text, written = {}, "{}", None
         for index, part in enumerate(exr.parts):
@@ -73,7 +87,9 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             if index == 0:
                 text, written = part.header.get("olpm_bench", "{}"), part.header.get("olpm_bench_digest")
         header = json.loads(text)
-    except (RuntimeError, ValueError, TypeError, StopIteration, AttributeError, MemoryError, RecursionError) as error:
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, StopIteration, AttributeError, KeyError, MemoryError, RecursionError) as error:
         raise ResultError(f"{path} is broken: {str(error) or 'no RGB or Y channel'}") from None
     if not parts or not isinstance(header, dict) or any(image.ndim != 3 or image.size == 0 for image in parts.values()):
         raise ResultError(f"{path} is broken: it holds no image")

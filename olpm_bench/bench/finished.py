@@ -13,7 +13,7 @@ import numpy as np
 
 from olpm_bench.bench import metrics, statistics
 from olpm_bench.bench.files import read_json
-from olpm_bench.bench.reference_file import Reference
+from olpm_bench.bench.reference_file import NEAR_FLOOR, Reference
 from olpm_bench.bench.results import Cell, Results
 from olpm_bench.bench.summary import complete_cells, work
 
@@ -75,21 +75,26 @@ class FinishedScene:
         return {method: [np.array([metrics.l1(image, truth) for image in cell.checkpoints()]) for cell in cells]
                 for method, cells in self.cells.items()}
 
+    @property
+    def least_error(self) -> float:
+        """The L1 error below which it is the reference's own; 0 if its noise is unknown."""
+        return NEAR_FLOOR * ((self.reference and self.reference.noise_floor) or 0.0)
+
     @cached_property
     def speed_ups(self) -> dict[str, statistics.Interval]:
         """Method -> its speed-up over the baseline at equal L1, a ratio of charged seconds; empty without reference."""
         if self.reference is None:
             return {}
         curves, unknown = self.curves(), statistics.Interval(np.nan, np.nan, np.nan)
-        return {method: statistics.speed_up(curves[self.baseline], curves[method]) if {self.baseline, method} <= curves.keys()
-                else unknown for method in self.cells if method != self.baseline}
+        return {method: statistics.speed_up(curves[self.baseline], curves[method], least=self.least_error)
+                if {self.baseline, method} <= curves.keys() else unknown for method in self.cells if method != self.baseline}
 
     @cached_property
     def worst_speed_ups(self) -> dict[str, float]:
         """Method -> its least speed-up over the baseline, of all L1 errors that both reach; empty without reference."""
         curves = self.curves() if self.reference is not None else {}
-        return {method: statistics.worst_speed_up(curves[self.baseline], curve) for method, curve in curves.items()
-                if self.baseline in curves}
+        return {method: statistics.worst_speed_up(curves[self.baseline], curve, self.least_error)
+                for method, curve in curves.items() if self.baseline in curves}
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Learnt:
 
 
 def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, int]], *, scene: str | None = None,
-            seed: int | None = None, number: int | None = None, path_seed: int = 0, passes: int = 16,
+            methods: Sequence[str] = (), seed: int | None = None, number: int | None = None, path_seed: int = 0, passes: int = 16,
             guides: Mapping[str, Path] | None = None) -> list[Path]:
     """Draw what each pixel meets, the records of each method, and where the particles of its training land, by room, if the
     scene is an embedded one that has several; returns the files written.
@@ -61,6 +61,7 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
         folder: of the experiment's results, which may not exist; pictures go to `inspect` in it.
         pixels: (x, y) from the top left.
         scene: one of the experiment's; may be left out where there is one only.
+        methods: some of the experiment's; by default `Experiment.shown`.
         seed: of the training; the experiment's first by default.
         number: of the vertex on the path that `path_seed` gives; the first that is not purely specular by default.
         passes: of the truth, `vertex.STRATA`^2 paths a bin each.
@@ -71,7 +72,7 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
         InputError, OSError: a guide that can't be read or trained; a link that leads out of `folder`.
     """
     require_inside(folder / "inspect", folder)
-    specs = _specs(experiment, scene, experiment.seeds[0] if seed is None else seed)
+    specs = _specs(experiment, scene, methods, experiment.seeds[0] if seed is None else seed)
     guided = [spec for spec in specs if spec.training is not None]
     files, name = dict(guides or {}), specs[0].scene.name
     for method in files:
@@ -109,12 +110,17 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
     return written
 
 
-def _specs(experiment: Experiment, scene: str | None, seed: int) -> list[CellSpec]:
+def _specs(experiment: Experiment, scene: str | None, methods: Sequence[str], seed: int) -> list[CellSpec]:
     """A scene's cells with one seed, in the order of the methods."""
     if scene is None and len(experiment.scene) > 1:
         raise ConfigError(f"{experiment.path}: which scene? --scene NAME, one of "
                           f"{', '.join(s.name for s in experiment.scene)}")
-    return experiment.of_scenes([scene] if scene else []).model_copy(update={"seeds": [seed]}).cells()
+    if unknown := set(methods) - {method.name for method in experiment.method}:
+        raise ConfigError(f"--method {sorted(unknown)[0]}: no such method in {experiment.path}; known: "
+                          f"{', '.join(method.name for method in experiment.method)}")
+    shown = methods or [method.name for method in experiment.shown]
+    cells = experiment.of_scenes([scene] if scene else []).model_copy(update={"seeds": [seed]}).cells()
+    return [spec for spec in cells if spec.method.name in shown]
 
 
 def _vertex(scene: mi.Scene, pixel: tuple[int, int], max_depth: int, number: int | None, seed: int) -> vertex.Vertex:

@@ -13,6 +13,8 @@ import numpy as np
 from olpm_bench.bench.exr import read_exr, write_exr
 from olpm_bench.bench.files import SCHEMA_VERSION, NewerSchemaError, ResultError, read_json, write_json
 
+NEAR_FLOOR = 2.0        # errors below this many noise floors are the reference's own, as much as the image's
+
 
 @dataclass
 class Reference:

@@ -20,7 +20,7 @@ import json
 import os
 import shutil
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,11 +89,15 @@ class Cell:
         return parts
 
 
-def warnings(cells: Sequence[Cell]) -> list[str]:
+def warnings(infos: Sequence[Mapping[str, Any]]) -> list[str]:
     """What the training of a method's cells in a scene has warned of, once each; and how much of what the camera sees is
-    guided, in the cell that has least, if that is little."""
-    said = [warning for cell in cells for warning in cell.info.get("warnings", [])]         # older cells say less
-    trained = min((share for cell in cells if (share := cell.info.get("trained")) is not None), default=1.0)
+    guided, in the cell that has least, if that is little.
+
+    Args:
+        infos: of the cells, as `bench.cell.measure` yields them.
+    """
+    said = [warning for info in infos for warning in info.get("warnings", [])]              # older cells say less
+    trained = min((share for info in infos if (share := info.get("trained")) is not None), default=1.0)
     if trained < TRAINED:
         said.append(f"only {trained:.0%} of the surfaces that the camera sees have records with particles enough to guide: more "
                     "photons or passes, or a larger record_radius; or light does not enter what it sees")

@@ -130,7 +130,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
             if cell is not None:
                 info = cell.info
                 flag = f", waited {info['wait_fraction']:.0%} for busy cores" if info["wait_fraction"] > WAITED else ""
-                flag += "".join(f"; {warning}" for warning in warnings([cell]))
+                flag += "".join(f"; {warning}" for warning in warnings([cell.info]))
                 bar.say(f"[{index + 1}/{len(todo)}] {spec}: {info['spp']} spp in {info['charged_seconds']:.1f} s, "
                         f"{info['train_seconds']:.1f} s of it training{flag}")
     return problems

@@ -170,11 +170,12 @@ def expanded_band(confidence: float, n: int) -> tuple[float, float]:
     return float(100 - high), float(high)
 
 
-def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Interval:
+def speed_up(baseline: Curve, method: Curve, error: float | None = None, least: float = 0.0) -> Interval:
     """Time of the baseline over time of the method at equal error (geometric mean over seeds), with a paired jackknife interval.
 
     Args:
         error: the error to reach; by default the lowest that both curves reach, found anew without each seed.
+        least: but none below this, where both curves level out in the noise of the reference.
 
     Returns:
         NaN where one of them does not reach the error, or both start below it.  Where only one starts below, the ratio with its
@@ -186,7 +187,7 @@ def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Inte
 
     def ratio(index: np.ndarray) -> tuple[float, str]:
         a, b = (np.exp(np.log(curve.errors[index]).mean(axis=0)) for curve in (baseline, method))
-        level = max(a.min(), b.min()) if error is None else error
+        level = max(a.min(), b.min(), least) if error is None else error
         below = a[0] < level, b[0] < level
         if all(below):
             return float("nan"), ""
@@ -202,14 +203,15 @@ def speed_up(baseline: Curve, method: Curve, error: float | None = None) -> Inte
     return interval._replace(value=value, bound=bound)
 
 
-def worst_speed_up(baseline: Curve, method: Curve) -> float:
+def worst_speed_up(baseline: Curve, method: Curve, least: float = 0.0) -> float:
     """The least ratio of the times at which two median curves are down to the same error, of all errors that both reach.
 
     Looked for at the points of either curve: between them the ratio's logarithm is linear in that of the error.  When a curve
-    was down to what it is below from the start was not measured.  NaN where there is no such error.
+    was down to what it is below from the start was not measured.  NaN where there is no such error of `least` or more.
     """
     a, b = baseline.median, method.median
-    ratios = [time_to_error(baseline.times, a, error) / time_to_error(method.times, b, error) for error in (*a, *b)]
+    ratios = [time_to_error(baseline.times, a, error) / time_to_error(method.times, b, error) for error in (*a, *b)
+              if error >= least]
     return min((ratio for ratio in ratios if np.isfinite(ratio)), default=float("nan"))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from olpm_bench.bench import metrics, statistics
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
+from olpm_bench.bench.reference_file import NEAR_FLOOR
 from olpm_bench.bench.results import Cell, Results, warnings
 
 LATE = 0.05                 # share of a budget in seconds by which a cell may exceed it, before that is said
@@ -64,9 +65,10 @@ def summarise(finished: Finished) -> dict[str, Any]:
 
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
     `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, and `overrun` is the
-    largest share by which a cell exceeds a budget in seconds.  `gain` is the baseline's work-normalised variance over the
-    method's, with its 90 % jackknife interval, and `worst_speed_up` by `statistics.worst_speed_up`; `warnings` are those of
-    training.  What has no value (a spread of one seed, the error of a scene without reference) is None.
+    largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.  `gain` is the
+    baseline's work-normalised variance over the method's, with its 90 % jackknife interval, and `worst_speed_up` by
+    `statistics.worst_speed_up`; `warnings` are those of training.  What has no value (a spread of one seed, the error of a scene
+    without reference) is None.
     """
     budget = finished.experiment.budget.seconds
     rows = [_row(scene, method, budget) for scene in finished.scenes for method in scene.cells]
@@ -100,7 +102,9 @@ def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, A
         "spp": _whole(np.median(info["spp"])), "records": _whole(np.median(info["records"])),
         "bytes_per_record": _whole(np.median(info["bytes_per_record"])),
         "particles": _whole(np.median(info["particles"])),
-        "worst_speed_up": scene.worst_speed_ups.get(method), "warnings": warnings(cells),
+        "worst_speed_up": scene.worst_speed_ups.get(method),
+        "noise_floor": scene.reference.noise_floor if scene.reference is not None else None,
+        "warnings": warnings([cell.info for cell in cells]),
     })
 
 
@@ -173,6 +177,8 @@ def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             said.append(f"waited {row['wait_fraction']:.0%} of its time for a busy core")
         if row["overrun"] is not None and row["overrun"] > LATE:
             said.append(f"took {row['overrun']:.0%} more time than its budget")
+        if row["noise_floor"] and row["l1"] < NEAR_FLOOR * row["noise_floor"]:
+            said.append(f"its L1 error is only {row['l1'] / row['noise_floor']:.2g} times the reference's noise, a part of it")
         if row["worst_speed_up"] is not None and row["worst_speed_up"] < SLOWER:
             said.append(f"{row['worst_speed_up']:.2g}x as fast as the baseline to the L1 error where it compares worst")
         found += [f"{row['scene']} / {row['method']}: {words}" for words in said]

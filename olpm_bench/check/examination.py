@@ -2,11 +2,13 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 from rich.console import Console
 from scipy import stats
 
@@ -68,9 +70,7 @@ def campaign(subject: Subject, checks: Sequence[Check], runs: int, folder: Path,
             "seconds": time.perf_counter() - start, "pictures": [
                 str(path) for o in failed if (path := _draw(o, one, folder / f"seed{seed}")) is not None]})
         if log is not None:
-            log.parent.mkdir(parents=True, exist_ok=True)
-            with log.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(found[seed], allow_nan=False) + "\n")
+            _append(log, json.dumps(found[seed], allow_nan=False))
         if not quiet:
             words = "; ".join(f"{o.check.name}: {o.verdict.worst}" for o in failed)
             verdicts.line(console, f"seed {seed}: {f'FAILED {words}' if failed else f'passed, p = {p:.3g}'}")
@@ -109,21 +109,35 @@ def calibration(lines: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def _about(subject: Subject, checks: Sequence[Check]) -> dict[str, Any]:
-    """What runs have in common that count together: what is examined, by which checks, and a hash of all code that does so."""
+    """What runs have in common that count together: what is examined, by which checks, a hash of all code that does so,
+    and versions."""
+    from olpm_bench.bench import environment
+
     files, own = sorted(Path(__file__).parent.glob("*.py")), subject.name.rpartition(":")[0]
     code = digest(own_code().encode(), *(file.read_bytes() for file in [*files, *([Path(own)] if own else [])]))
     return plain({"representation": subject.specification, "declared": sorted(subject.declared),
-                  "checks": [check.name for check in checks], "code": code})
+                  "checks": [check.name for check in checks], "code": code, "variant": mi.variant(),
+                  "versions": environment.versions()})
+
+
+def _append(log: Path, line: str) -> None:
+    """Add a line, after what a process that was killed may have left of one."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    cut = log.exists() and log.read_bytes()[-1:] not in (b"", b"\n")
+    with log.open("a", encoding="utf-8") as file:
+        file.write("\n" * cut + line + "\n")
 
 
 def _logged(log: Path | None, about: dict[str, Any]) -> dict[int, dict[str, Any]]:
     """The runs in the file that are `about` the same, by their seeds.
 
     Raises:
-        ResultError: a line that is none of ours.
+        ResultError: a line that is none of ours, nor the beginning of one.
     """
     found, text = {}, log.read_text(encoding="utf-8", errors="replace") if log and log.exists() else ""
     for number, line in enumerate(text.splitlines(), 1):
+        if line.startswith('{"') and not line.endswith("}"):        # a process was killed while it wrote
+            continue
         try:
             run = json.loads(line)
             if all(run[key] == value for key, value in about.items()):
@@ -144,16 +158,19 @@ def _run(subject: Subject, checks: Sequence[Check]) -> list[Outcome]:
 
 
 def _draw(outcome: Outcome, subject: Subject, folder: Path) -> Path | None:
-    """The picture of a failure; None if it passed, has none, or the representation can't even be asked for it."""
+    """The picture of a failure; None if it passed, has none, the representation can't even be asked for it, or it can't be
+    written: verdicts do not depend on pictures."""
     verdict = outcome.verdict
     if verdict.passed or verdict.picture is None:
         return None
+    path = folder / slug(Path(subject.name.replace(":", "-")).name) / f"{outcome.check.name}.png"
     try:
-        panels = verdict.picture()
+        verdicts.picture(verdict.picture(), f"{subject.name}, {outcome.check.name}: {verdict.worst}", path)
+        return path
+    except OSError as error:
+        print(f"olpm-bench: no picture of {outcome.check.name}: {error}", file=sys.stderr)
+        return None
     except Exception as error:          # other people's code, which has failed before
         if is_interrupt(error):
             raise
         return None
-    path = folder / slug(Path(subject.name.replace(":", "-")).name) / f"{outcome.check.name}.png"
-    verdicts.picture(panels, f"{subject.name}, {outcome.check.name}: {verdict.worst}", path)
-    return path

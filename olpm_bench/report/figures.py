@@ -16,6 +16,7 @@ import numpy as np
 
 from olpm_bench.bench import statistics
 from olpm_bench.bench.files import replacing
+from olpm_bench.bench.reference_file import NEAR_FLOOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +29,6 @@ STYLE = Path(__file__).with_name("olpm_bench.mplstyle")
 GREY = "#8a8a8a"
 TIMES = "\N{MULTIPLICATION SIGN}"
 PLAIN: dict[str, Any] = {"marker": "none", "linestyle": "-"}
-NEAR_FLOOR = 2.0                # errors below this many noise floors are the reference's own: drawn faintly
 NEAR_LABEL = 0.8                # curves that end further left, in axes units, are not tied to their labels
 PANEL = (2.75, 2.05)            # width, height of a panel's axes [inch]
 COLUMNS = 2                     # panels side by side
@@ -345,7 +345,7 @@ def tick_label(value: float) -> str:
 
 def _draw_curve(axes: Axes, curve: statistics.Curve, style: Mapping[str, Any], floor: float) -> None:
     band = statistics.median_band(curve.errors)
-    near = band.median < NEAR_FLOOR * floor
+    near = band.median < NEAR_FLOOR * floor         # drawn faintly
     axes.fill_between(curve.times, band.low, band.high, color=style["color"], alpha=0.17, linewidth=0)
     if near.any():
         axes.plot(curve.times, band.median, **{**style, **PLAIN}, linewidth=0.6, alpha=0.5)

@@ -26,6 +26,7 @@ from olpm_bench.report import sheet, tonemap
 if TYPE_CHECKING:
     from olpm_bench.bench.config import Experiment
     from olpm_bench.bench.finished import Finished, FinishedScene
+    from olpm_bench.bench.reference_file import Reference
 
 TEMPLATE = "page.html.jinja"
 LARGEST = 12e6                          # bytes of all images; base64 makes 16 MB of them
@@ -67,11 +68,12 @@ def page(found: Finished, rows: Sequence[Mapping[str, Any]], blocks: Sequence[sh
     import simpleimageio
 
     experiment, results = found.experiment, found.results
+    made_by = commands(experiment, results, found.compared)
     environment = jinja2.Environment(loader=jinja2.PackageLoader("olpm_bench", "report"), autoescape=True, trim_blocks=True,
                                      lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     text = environment.get_template(TEMPLATE).render(
-        experiment=experiment, budget=sheet.budget(experiment), commands=commands(experiment, results),
-        command=commands(experiment, results)[-1], machines="; ".join(found.machines),
+        experiment=experiment, budget=sheet.budget(experiment), commands=made_by, command=made_by[-1],
+        machines="; ".join(found.machines),
         viewers=viewers(found, blocks), headers=HEADERS, rows=table(rows), notes=summary.notes(rows),
         speed_ups=summary.speed_up_lines(found.speed_ups, experiment.baseline_name),
         figures=[{"name": name, "svg": svg(results.folder / f"{name}.svg", CAPTIONS[name]), "caption": CAPTIONS[name]}
@@ -82,10 +84,24 @@ def page(found: Finished, rows: Sequence[Mapping[str, Any]], blocks: Sequence[sh
     return ["report.html"]
 
 
-def commands(experiment: Experiment, results: Results) -> list[str]:
-    """What makes these results: the references, if there are any, and then the run."""
-    names = ["reference"] * any(scene.has_reference for scene in experiment.scene) + ["run"]
-    return [experiment.command(name, Path(os.path.relpath(results.folder.parent))) for name in names]
+def commands(experiment: Experiment, results: Results, compared: Sequence[FinishedScene]) -> list[str]:
+    """What makes these results: the references, if there are any, in as much time as they took, and then the run."""
+    root, seconds = Path(os.path.relpath(results.folder.parent)), [scene.reference.meta.get("seconds", 0) for scene in compared]
+    made = [f"{experiment.command('reference', root)} --seconds {math.ceil(max(seconds))}"] if any(seconds) else []
+    return [*made, experiment.command("run", root)]
+
+
+def origin(reference: Reference) -> str:
+    """How a reference was made, as far as it says."""
+    meta = reference.meta
+    said = [meta.get("estimator", "of unknown origin")]
+    if reference.has_halves:
+        said.append(f"{meta['spp_a'] + meta['spp_b']:,} spp")
+    if "seconds" in meta:
+        said.append(f"{meta['seconds']:,.0f} s")
+    if reference.noise_floor is not None:
+        said.append(f"L1 of its noise {summary.number(reference.noise_floor)}")
+    return "reference: " + ", ".join(said)
 
 
 # ---------------------------------------------------------------- images
@@ -99,11 +115,13 @@ def viewers(found: Finished, blocks: Sequence[sheet.Block]) -> list[dict[str, An
     forms = itertools.chain([(1, "single")], ((k, "rgbe") for k in itertools.count(1)))
     k, kind = next((k, kind) for k, kind in forms if pixels / k**2 * BYTES[kind] <= LARGEST)
     shown = []
-    for i, (scene, group) in enumerate(zip(experiment.scene, groups, strict=True)):
+    for i, (finished, scene, group) in enumerate(zip(found.scenes, experiment.scene, groups, strict=True)):
         group = [picture._replace(image=sheet.resize(picture.image, scene.width // k)) for picture in group] if k > 1 else group
         height, width, _ = group[0].image.shape
         caption = f"{sheet.shown(experiment, scene.has_reference)}; {scene.width} \N{MULTIPLICATION SIGN} {scene.height} pixels"
-        shown.append({"scene": scene.name, "caption": caption + (f", averaged over {k} by {k}" if k > 1 else ""),
+        caption += f", averaged over {k} by {k}" if k > 1 else ""
+        caption += f"; {origin(finished.reference)}" if finished.reference is not None else ""
+        shown.append({"scene": scene.name, "caption": caption,
                       "aspect": width / height, "data": flip_book(f"viewer-{i}", group, kind)})
     return shown
 

@@ -81,7 +81,7 @@ def picture(panels: Sequence[Panel], title: str, out: Path) -> None:
             a.set_title(panel.title)
             a.set_axis_off()
             figure.colorbar(shown, ax=a, location="bottom", fraction=0.05, pad=0.02, aspect=30, label=panel.unit)
-        figure.suptitle("\n".join(textwrap.wrap(title, 40 * len(panels))))
+        figure.suptitle("\n".join(textwrap.wrap(title, 40 * len(panels))), parse_math=False)
         with replacing(out) as beside:
             figure.savefig(beside, dpi=160)
         plt.close(figure)

@@ -17,7 +17,6 @@ All is decided by the order of particles and never by the scheduling of threads.
 """
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -154,6 +153,7 @@ class RecordCache:
         self.points = np.zeros((0, 6), np.float32)                  # records: p, n, ...
         self.radii = np.zeros(0, np.float32)                        # ... R [scene units]
         self.cells = Cells.none()
+        self.full = False                                           # more are wanted than there can be
 
     def __len__(self) -> int:
         return len(self.points)
@@ -268,8 +268,7 @@ class RecordCache:
         radius = self.clamped(cells.point).astype(np.float32)
         added = _independent(cells.point, uncovered, radius)
         if len(self) + len(added) > MOST_RECORDS:
-            warnings.warn(f"{MOST_RECORDS} records: the rest of the surfaces stays unguided; make record_radius larger",
-                          stacklevel=4)
+            self.full = True
             added = added[:MOST_RECORDS - len(self)]
         added = added[:0] if len(added) < LEAST else added              # a single one waits
         self.points = np.concatenate([self.points, cells.point[added]])

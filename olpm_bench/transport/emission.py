@@ -45,6 +45,7 @@ ENOUGH = 100_000                    # importons of a pass that are learnt from
 MOST = 2000                         # of these a record takes
 CLAMP = 100                         # heavier importons count as this many times the pass's mean weight
 INNER = 0.99                        # of the importance leaves through the guided disk
+OUTSIDE = 0.1                       # of that of a later pass beside it, from which on there is a new one
 
 
 def distant_lights(scene: mi.Scene) -> list[mi.Emitter]:
@@ -76,7 +77,7 @@ class EmissionGuide:
         self.importance = np.zeros(N_BLOCKS)                                        # x radiance of each block, over all passes
         self.waiting: list[np.ndarray] | None = []                                  # importons before there is a guided disk
         self.guided_center, self.guided_radius = self.center, self.disk             # of the guided disk
-        self.learnt = False
+        self.learnt, self.unguided = False, len(self.lights)                        # lights whose photons nothing guides
 
     def _tabulate_radiance(self) -> None:
         """Mean luminance in each cell of the raster, as shares of its block."""
@@ -140,12 +141,16 @@ class EmissionGuide:
             self.waiting = None
             if self.has_environment:
                 self._tabulate_radiance()
-            self._aim(new[:3].astype(float), new[3:6].astype(float), np.minimum(new[6], CLAMP * new[6].mean()))
+            self._aim(new)
         weight = np.minimum(new[6], CLAMP * new[6].mean())
-        d = mi.Vector3f([copied(mi.Float, x) for x in new[3:6]])
+        p, d = mi.Point3f([copied(mi.Float, x) for x in new[:3]]), mi.Vector3f([copied(mi.Float, x) for x in new[3:6]])
         light = new[7].astype(np.int64)
         block = _cell(d).numpy().astype(np.int64) // BLOCK ** 2
-        wo, inside = self._to_hemisphere(mi.Point3f([copied(mi.Float, x) for x in new[:3]]), d)
+        wo, inside = self._to_hemisphere(p, d)
+        if weight[~inside.numpy()].sum() > OUTSIDE * weight.sum():          # they have found another way out: begin again
+            self._aim(new)
+            self.records[:], self.seen, self.state = MISSING, np.zeros(0, np.int64), self.representation.init(0)
+            wo, inside = self._to_hemisphere(p, d)
         wo = np.stack([x.numpy() for x in wo])
 
         # Each teaches the records of its block, area and zone, or that of its directional light
@@ -172,12 +177,14 @@ class EmissionGuide:
         dr.eval(self.state)
         self._tabulate()
 
-    def _aim(self, p: np.ndarray, d: np.ndarray, weight: np.ndarray) -> None:
+    def _aim(self, departures: np.ndarray) -> None:
         """Centre and radius of the guided disk: the point nearest to all rays, and what holds nearly all of them.
 
         Least squares, sum w |(1 - d d^T)(p - c)|^2 (and a little |p - c|^2, for parallel rays): if all rays pass one window,
         that is where it is, and seen from there positions hardly depend on the direction.
         """
+        p, d = departures[:3].astype(float), departures[3:6].astype(float)
+        weight = np.minimum(departures[6], CLAMP * departures[6].mean())
         weight = weight / weight.sum()
         across = np.eye(3)[..., None] * (1 + 1e-3) - d[:, None] * d
         center = np.linalg.solve(np.einsum("ijn,n->ij", across, weight), np.einsum("ijn,jn,n->i", across, p, weight))
@@ -218,7 +225,7 @@ class EmissionGuide:
             self.mass = copied(mi.Float, mass.astype(np.float32))
             self.mass_sums = copied(mi.Float, np.cumsum(mass).astype(np.float32))
         self.own_share = copied(mi.Float, np.where(guided, self.fraction, 1).astype(np.float32))
-        self.learnt = True
+        self.learnt, self.unguided = True, int(np.sum(~guided))
 
     # ---------------------- Emission ----------------------
 

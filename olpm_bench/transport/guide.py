@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -193,7 +194,7 @@ class Guide:
     # ---------------------- Files ----------------------
 
     def save(self, path: str | Path) -> None:
-        """Write the guide to a compressed ``.npz`` file."""
+        """Write the guide to a compressed ``.npz`` file, which takes the place of one that is there when it is whole."""
         meta = {"format": FORMAT, "representation": self.specification, "fraction": self.fraction, "parallax": self.parallax,
                 "particles": self.particles}
         arrays = {f"cache.{k}": v for k, v in self.cache.to_numpy().items()}
@@ -202,8 +203,13 @@ class Guide:
         if self.pixels is not None:
             arrays["pixels"] = self.pixels.luminance
         arrays |= {"meta": np.array(json.dumps(meta)), "count": self.count.numpy()}
-        with open(path, "wb") as file:
-            np.savez_compressed(file, **arrays)         # type: ignore[arg-type]
+        beside = Path(path).with_name(f".{Path(path).name}.{os.getpid()}.tmp")
+        try:
+            with open(beside, "wb") as file:
+                np.savez_compressed(file, **arrays)     # type: ignore[arg-type]
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
 
     @staticmethod
     def load(path: str | Path, representation: str | None = None) -> Guide:

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from olpm_bench.transport import roulette
 from olpm_bench.transport.camera_paths import CameraPaths
-from olpm_bench.transport.camera_rays import CameraRays, paths_a_lane
+from olpm_bench.transport.camera_rays import CameraRays, paths_a_lane, sums_samples
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
 from olpm_bench.transport.settings import IntegratorSettings
 
@@ -64,13 +64,18 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             sampler = mi.load_dict({"type": "independent"})
             sampler.seed(dr.opaque(mi.UInt32, seed), dr.width(camera.corner))
             film.prepare([])
-            ray, weight, position = camera.next(sampler)
-            L, valid, _ = self.walk(scene, sampler, ray, True, weight, camera, log)
-            block = film.create_block()
-            self._splat(block, film, position, L, camera.paths_a_lane, dr.select(valid, mi.Float(1), 0), ray)
-            film.put_block(block)
+            ray, importance, position = camera.next(sampler)
+            L, valid, _ = self.walk(scene, sampler, ray, True, importance, camera, log)
+            weight, alpha = camera.paths_a_lane, dr.select(valid, mi.Float(1), 0)
             if log is not None:
                 dr.schedule(*log.arrays())
+            if sums_samples(film):
+                dr.eval(L)              # all at once: each part that is summed by itself would trace all paths
+                L, position = camera.sum_pixels(L)
+                weight, alpha = dr.opaque(mi.Float, spp), mi.Float(1)
+            block = film.create_block()
+            self._splat(block, film, position, L, weight, alpha, ray)
+            film.put_block(block)
             return film.develop()
 
     def paths_a_lane(self, sensor: mi.Sensor, spp: int) -> int:

@@ -33,6 +33,7 @@ from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings
 from olpm_bench.transport.view import records_seen
 from olpm_bench.transport.window import by_contribution
+from representations.interface import ParticleBatch
 
 LITTLE = 0.05       # share of what the camera sees that is guided, below which `train` warns
 SETTLE = 3          # gathers from which the records of a single batch find their radii, as on-line in as many passes
@@ -208,13 +209,13 @@ class Training:
             if self.emission is not None and importons.departures is not None:
                 with _Seconds(statistics, "update"):
                     self.emission.learn(importons.departures, self._next_seed())
-                if not self.emission.learnt:
-                    statistics.warnings.append("too few importons leave towards the lights at infinity: their photons start as "
-                                               "the emitters sample them")
             statistics.importons = n
         return statistics
 
     def _photons(self, statistics: PassStatistics) -> PassStatistics:
+        if self.emission is not None and (unguided := self.emission.unguided):
+            statistics.warnings.append(f"too few importons leave towards {unguided} of {len(self.emission.lights)} lights at "
+                                       "infinity: their photons start as the emitters sample them")
         return self._learn_photons(self.settings.photons, self.importance, statistics)
 
     def _single_batch(self, statistics: PassStatistics) -> PassStatistics:
@@ -274,9 +275,15 @@ class Training:
             p, weight, _, _, n = particles.read(particles.place)
             if self.settings.shrink:
                 guide.shrink()
-            guide.grow(p, n, weight > 0, self._next_seed())
+            self._grow(guide, p, n, weight > 0, statistics)
         with _Seconds(statistics, "gather"):
             return GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours, self.settings.parallax)
+
+    def _grow(self, guide: Guide, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, statistics: PassStatistics) -> None:
+        guide.grow(p, n, active, self._next_seed())
+        if guide.cache.full:
+            statistics.warnings.append(f"{guide.records} records, the most there can be: the rest of the surfaces stays "
+                                       "unguided; make record_radius larger")
 
     def _camera_pass(self, statistics: PassStatistics) -> PassStatistics:
         """Render an image with the guide as it is, and learn from its paths."""
@@ -290,9 +297,11 @@ class Training:
         if len(vertices):
             with _Seconds(statistics, "grow"):
                 p, _, _, _, n = vertices.read(vertices.place)
-                guide.grow(p, n, dr.squared_norm(n) > 0, self._next_seed())         # not where all is specular
+                self._grow(guide, p, n, dr.squared_norm(n) > 0, statistics)         # not where all is specular
             with _Seconds(statistics, "gather"):
-                batch = binned(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
+                batch = ParticleBatch.empty(guide.records)
+                if self.settings.learn_radiance:
+                    batch = binned(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
             if len(place):          # a record serves some of them
                 with _Seconds(statistics, "update"):
@@ -301,17 +310,22 @@ class Training:
             statistics.kept = len(batch)
         else:
             statistics.warnings.append("the camera sees no surface: there is nothing to guide")
-        self._estimate_pixels(image, spp)
+        self._estimate_pixels(image, spp, statistics)
         if len(vertices) and not np.any(self.luminance):
             statistics.warnings.append("no camera path has met light: it may not enter what the camera sees")
         statistics.spp, statistics.stored, statistics.image = spp, len(vertices), image
         statistics.records = guide.records
         return statistics
 
-    def _estimate_pixels(self, image: mi.TensorXf, spp: int) -> None:
+    def _estimate_pixels(self, image: mi.TensorXf, spp: int, statistics: PassStatistics) -> None:
         """Tell the guide what pixels are worth, from all camera passes so far."""
         grey = mi.Bitmap(image).convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, srgb_gamma=False)
         luminance = np.array(grey, np.float64).reshape(image.shape[:2])
+        invalid = ~np.isfinite(luminance)
+        if invalid.any():           # one would be in every pixel's estimate
+            statistics.warnings.append(f"{invalid.sum()} pixels of a training image are NaN or infinite: look for such values in "
+                                       "the scene's textures and lights")
+            luminance[invalid] = 0
         before = 0.0 if self.luminance is None else self.luminance
         self.spp += spp
         self.luminance = before + (luminance - before) * spp / self.spp

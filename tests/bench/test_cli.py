@@ -263,6 +263,15 @@ def test_render_writes_an_image_and_ends_with_json(tmp_path):
     assert header["spp"] == 5 and (tmp_path / "box.png").stat().st_size > 0
 
 
+def test_render_says_what_could_not_be_learnt(tmp_path, monkeypatch):
+    from olpm_bench.bench import render_one
+
+    monkeypatch.setattr(render_one, "render", lambda *_, **__: {"warnings": ["no camera path has met light"], "trained": 0.3})
+    result = call("render", "cornell_box", "--method", "jensen", "--spp", 1, "--out", tmp_path / "x.exr")
+    assert result.exit_code == 0 and "olpm-bench: no camera path has met light\n" in result.stderr
+    assert "olpm-bench: only 30% of the surfaces" in result.stderr and json.loads(result.stdout)["trained"] == 0.3
+
+
 def test_a_guide_is_saved_and_used_again(tmp_path):
     options = ("--method", "cosine", "--spp", 2, "--width", 16, "--height", 12, "--max-depth", 3)
     training = ("--set", "training.passes=1", "--set", "training.photons=500", "--set", "training.importons=100",

@@ -2,8 +2,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from olpm_bench.bench.exr import read_exr, write_exr
+from olpm_bench.transport import headroom
+from olpm_bench.transport.settings import InputError
 
 
 def test_exr_is_exact(tmp_path):
@@ -12,3 +15,13 @@ def test_exr_is_exact(tmp_path):
     parts, header = read_exr(tmp_path / "x.exr")
     np.testing.assert_array_equal(parts["mean"], pixels)
     assert header == {"text": 'ä "b"', "number": 0.1}
+
+
+def test_images_larger_than_memory_are_refused_before_they_are_unpacked(tmp_path, monkeypatch):
+    """A black image of 12 MB is a file of some kB."""
+    path = tmp_path / "black.exr"
+    write_exr(path, {"mean": np.zeros((1000, 1000, 3), np.float32)})
+    assert path.stat().st_size < 100_000
+    monkeypatch.setattr(headroom, "free", lambda: 3e7)
+    with pytest.raises(InputError, match=r"black.exr: its images take about 0.036 GB, and 0.03 GB are free"):
+        read_exr(path)

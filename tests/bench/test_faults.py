@@ -2,6 +2,7 @@
 and what is said names the file and what happens next.  Kill -9 is in test_kills.py."""
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -164,6 +165,21 @@ def test_a_full_disk_leaves_the_last_complete_cell(tmp_path):
         assert ".tmp" not in line and "None" not in line and "lock" not in line.split()[-1]
     assert len({line.split(":")[0].partition("/")[2] for line in lines}) > 3       # it was full at different moments
     assert any(line.endswith("cell.json,checkpoints.exr,image.exr,trace.jsonl") for line in lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [4, 12, 48, 160])
+def test_commands_on_a_full_disk_say_so_in_a_line(tmp_path, size):
+    """Disks of so many KiB, which are full with the first file, with some cell, or with the figures."""
+    (results := tmp_path / "results").mkdir()
+    for command, content in ((["reference", "--seconds", "1"], TOML), (["run"], BARE)):
+        (tmp_path / "test.toml").write_text(content)
+        script = [sys.executable, "-m", "olpm_bench.cli", *command, str(tmp_path / "test.toml"), "--results", str(results)]
+        if (done := on_a_disk(f"mount -t tmpfs -o size={size}k none {results}", script, tmp_path)) is None:
+            pytest.skip("there can be no such disk here")
+        assert done.returncode in (0, 1, 2) and "Traceback" not in done.stderr and ".tmp" not in done.stderr, done.stderr
+        assert (done.returncode == 0) == ("No space left on device" not in done.stderr), done.stderr
+        assert done.returncode or size > 12
 
 
 def test_a_read_only_folder_is_one_line_and_at_once(tmp_path):
@@ -433,6 +449,28 @@ def test_ctrl_c_at_any_write_leaves_the_old_cell_or_the_new_one(tmp_path):
     assert len(outcomes) > 20 and set(outcomes) >= {"k0", "k1", None}
     changes = [a for a, b in zip([*outcomes, ""], ["", *outcomes], strict=True) if a != b and a != ""]
     assert changes[0] == "k0" and changes[-1] == "k1"
+
+
+def test_ctrl_c_at_any_write_leaves_the_old_reference_or_the_new_one(tmp_path):
+    """Whose halves, variances and samples are of one moment."""
+    sys.addaudithook(_interrupt)
+    images = [image(seed=i) for i in range(8)]
+    INTERRUPT_AT["below"], outcomes = str(tmp_path), []
+    for at in range(1, 1000):
+        for halves, spp in ((images[:4], 3), (images[4:], 5)):
+            INTERRUPT_AT["left"] = at if spp == 5 else 0
+            with contextlib.suppress(KeyboardInterrupt):
+                write_reference(tmp_path / "k", Reference(*halves, {"spp_a": spp, "spp_b": spp}))
+        if INTERRUPT_AT["left"]:        # there are fewer
+            break
+        found = read_reference(tmp_path / "k", 16, 9)
+        outcomes.append(spp := found.meta["spp_a"])
+        expected = images[:4] if spp == 3 else images[4:]
+        assert found.meta["spp_b"] == spp
+        assert all(map(np.array_equal, (found.a, found.b, found.a_variance, found.b_variance), expected))
+        assert not [path for path in tmp_path.rglob("*") if ".tmp" in path.name], at
+    INTERRUPT_AT["left"] = 0
+    assert len(outcomes) > 5 and outcomes == sorted(outcomes) and set(outcomes) == {3, 5}
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])

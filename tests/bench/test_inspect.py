@@ -95,6 +95,30 @@ def test_a_scale_has_pictures_of_its_own(experiment, tmp_path, monkeypatch):
     assert asked == [(8, tmp_path / "test-small")]
 
 
+def test_the_first_scene_named_is_the_one_and_others_say_where_they_are(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(inspect, "inspect",
+                        lambda loaded, *_, scene, **__: asked.append((scene, [s.file for s in loaded.scene])) or [])
+    (tmp_path / "room.xml").write_text('<scene version="3.0.0"/>')
+    (tmp_path / "two.toml").write_text(TWO.replace('name = "door_ajar"', 'name = "hall"\nfile = "hall.xml"')
+                                       .replace('name = "cornell_box"', 'name = "room"\nfile = "nowhere.xml"'))
+    result = call("inspect", tmp_path / "two.toml", "--pixel", "1,1", "--scene", f"room={tmp_path / 'room.xml'}",
+                  "--scene", f"hall={tmp_path / 'room.xml'}")
+    assert result.exit_code == 0, result.output
+    assert asked == [("room", [tmp_path / "room.xml"] * 2)]
+
+
+def test_methods_are_those_named_or_what_figures_show(tmp_path):
+    def found(*methods: str) -> list[str]:
+        return [spec.method.name for spec in inspect._specs(loaded, None, methods, 0)]
+
+    sweep = 'sweep = { "training.photons" = [1000, 2000, 3000, 4000, 5000, 6000, 7000, 8000, 9000] }\n'
+    (tmp_path / "sweep.toml").write_text(TOML + sweep)
+    loaded = experiment_file.load(tmp_path / "sweep.toml")
+    assert found() == ["Path tracing", "Cosine, photons 9,000"]
+    assert found("Cosine, photons 2,000") == ["Cosine, photons 2,000"]
+
+
 def test_no_link_leads_out_of_the_results_folder(experiment, tmp_path):
     (tmp_path / "test").mkdir()
     (tmp_path / "test" / "inspect").symlink_to("/sys")
@@ -108,6 +132,7 @@ def test_no_link_leads_out_of_the_results_folder(experiment, tmp_path):
     (("two.toml", "--pixel", "1,1"), ["which scene? --scene NAME", "door_ajar, cornell_box"]),
     (("two.toml", "--pixel", "1,1", "--scene", "room"), ["no scene 'room'", "known: door_ajar, cornell_box"]),
     (("test.toml", "--pixel", "1"), ["--pixel 1:", "X,Y"]),
+    (("test.toml", "--pixel", "1,1", "--method", "GMM"), ["--method GMM: no such method", "known: Path tracing, Cosine"]),
     (("test.toml", "--pixel", "16,3"), ["pixel 16,3 is outside the image, 16x12"]),
     (("test.toml", "--pixel", "8,10", "--vertex", "7"), ["has 2 vertices, no vertex 7"]),
     (("test.toml", "--pixel", "8,10", "--guide", "g.npz"), ["--guide g.npz: must be NAME=PATH"]),

@@ -119,7 +119,7 @@ def test_the_commands_that_are_suggested_are_those_that_work(tmp_path, monkeypat
         with pytest.raises(ResultError) as error:
             fails()
         said.append(str(error.value).partition("make it with: ")[2].partition(", or do without")[0])
-    for command in (*said, *page.commands(small, results)):
+    for command in (*said, *page.commands(small, results, [])):
         words = shlex.split(command)
         assert words[0] == "olpm-bench" and words[1] in ("run", "reference")
         assert words[2:] == ["test.toml", "--scale", "small", "--results", "out", "--scene=room=my room.xml"]

@@ -82,6 +82,7 @@ def test_speed_up_of_two_converging_curves_is_the_squared_ratio_of_their_errors(
 def test_speed_up_only_where_both_curves_reach_the_error():
     slow, fast = curve(4, 4), curve(2, 2)
     assert np.isnan(statistics.speed_up(slow, fast, error=0.9).value)       # slow ends at 1
+    assert statistics.speed_up(slow, fast, least=1.5).value == pytest.approx(4)
     assert np.isnan(statistics.speed_up(slow, fast, error=4.5).value)       # both start below
     bounded = statistics.speed_up(slow, fast, error=2.5)                    # fast starts at 2, at time 1
     assert bounded.value == pytest.approx((4 / 2.5) ** 2) and bounded.bound == ">"
@@ -102,6 +103,7 @@ def test_the_worst_speed_up_is_where_a_method_has_just_begun():
     assert statistics.worst_speed_up(slow, slow) == 1
     assert np.isnan(statistics.worst_speed_up(slow, curve(40)))                 # which ends at 10, and slow begins at 4
     assert np.isnan(statistics.worst_speed_up(slow, curve(0.4)))
+    assert statistics.worst_speed_up(fast, slow, least=1.5) == pytest.approx((3 + 4 / 1.5**2) / (16 / 1.5**2), rel=0.02)
 
 
 def test_a_speed_up_that_a_seed_less_leaves_unmeasured_has_no_interval():

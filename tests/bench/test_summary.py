@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from olpm_bench.transport.settings import IntegratorSettings
 KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "mape", "smape", "relmse", "relmse_trimmed", "flip", "ssim_error",
         "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "charged_seconds", "overrun",
         "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
-        "bytes_per_record", "particles", "worst_speed_up", "warnings"]
+        "bytes_per_record", "particles", "worst_speed_up", "noise_floor", "warnings"]
 ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
 TIMES = [1.0, 4.0, 16.0]
 
@@ -103,7 +104,7 @@ def without_reference(known, **changes) -> SimpleNamespace:
 def test_a_scene_without_reference_has_no_errors_but_all_the_rest(known):
     rows, expected = summarised(without_reference(known))["rows"], summarised(known)["rows"]
     for row, full in zip(rows, expected, strict=True):
-        errors = [*KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1], "worst_speed_up"]
+        errors = [*KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1], "worst_speed_up", "noise_floor"]
         assert [row[key] for key in errors] == [None] * len(errors)
         assert {k: v for k, v in row.items() if k not in errors} == {k: v for k, v in full.items() if k not in errors}
     assert finished.read(without_reference(known).experiment, known.results, {}).speed_ups == {"Fast": {}}
@@ -154,6 +155,17 @@ def test_who_is_slower_to_some_error_is_named(known):
     known.experiment = known.experiment.model_copy(update={"baseline": "Fast"})
     rows = summarised(known)["rows"]
     assert "door_ajar / Slow: 0.25x as fast as the baseline to the L1 error where it compares worst" in summary.notes(rows)
+
+
+def test_what_the_noise_of_the_reference_hides_is_not_compared(known):
+    """Its halves differ by 0.3: below twice 0.15 errors are its own.  Slow falls as 2 / sqrt(t), Fast as 1 / sqrt(t) from 1 s."""
+    true, off = known.references["door_ajar"], np.float32(0.15)
+    known.references = {"door_ajar": dataclasses.replace(true, a=true.a + off, b=true.b - off)}
+    scene, = finished.read(known.experiment, known.results, known.references).scenes
+    assert scene.least_error == pytest.approx(0.3) and scene.worst_speed_ups["Fast"] == pytest.approx(4, rel=1e-4)
+    rows = summarised(known)["rows"]
+    assert [row["noise_floor"] for row in rows] == pytest.approx([0.15, 0.15])
+    assert summary.notes(rows) == ["door_ajar / Fast: its L1 error is only 1.7 times the reference's noise, a part of it"]
 
 
 def test_gains_and_speed_ups_are_over_the_baseline(known):

@@ -172,10 +172,31 @@ def test_a_campaign_goes_on_from_its_log(tmp_path: Path) -> None:
     seed, total, *_ = campaign("--seed", 9)
     assert seed.startswith("seed 9") and "0 of 1 runs" in total and len(log.read_text().splitlines()) == 5
     good = log.read_bytes()
-    for bad in (b'{"seed": 1', b"PK\x03\x04\xff\xfe", b"[" * 100_000):
+    for bad in (b'{"seed": 1}', b"PK\x03\x04\xff\xfe", b"[" * 100_000):
         log.write_bytes(good + bad)
         result = call(f"{mine}:Mine", "--log", log)
         assert result.exit_code == 2 and "line 6 is broken" in result.stderr and len(result.stderr.splitlines()) == 1
+
+
+def test_a_campaign_goes_on_after_a_line_that_a_kill_cut_short(tmp_path: Path) -> None:
+    log, command = tmp_path / "log.jsonl", ["jensen", "--only", "scale", "--log", tmp_path / "log.jsonl"]
+    assert call(*command, "--repeat", 2).exit_code == 0
+    first, second, end = log.read_text().split("\n")
+    log.write_text(first + "\n" + second[:len(second) // 2])
+    result = call(*command, "--repeat", 2)
+    assert result.exit_code == 0 and "0 of 2 runs" in result.stdout and result.stdout.startswith("seed 1: passed")
+    assert log.read_text().startswith(first + "\n" + second[:len(second) // 2] + "\n{") and end == ""
+    assert "0 of 3 runs" in call(*command, "--repeat", 3).stdout
+
+
+def test_a_failure_is_told_where_no_picture_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    arguments = [f"{MUTANTS}:PdfTimesTen", "--only", "integral", "--pictures", tmp_path / "file"]
+    result = call(*arguments)
+    assert result.exit_code == 1 and "1 of 1 checks FAILED" in result.stdout and "no picture of integral: " in result.stderr
+    log = tmp_path / "log.jsonl"
+    result = call(*arguments, "--repeat", 1, "--log", log)
+    assert result.exit_code == 1 and json.loads(log.read_text())["passed"] is False
 
 
 @pytest.mark.parametrize(("power", "exit_code", "share"), [(1, 0, 0.1), (2, 1, 0.1**0.5), (0.5, 0, 0.01)],

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import resource
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,29 @@ PATHS = {"os.rename": 2, "os.link": 2, "os.symlink": 2, "os.mkdir": 1, "os.trunc
 touched: list[str] = []         # what the file that is being read makes us write, make, rename or remove
 
 
-def child() -> probe.Process:
+class Child(probe.Process):
+    """Counts what it answers, so that a campaign can say how many files were read, and how many refused."""
+
+    def __init__(self) -> None:
+        super().__init__([sys.executable, __file__], SECONDS)
+        self.answers: Counter[str] = Counter()
+
+    def __enter__(self) -> Child:
+        return self
+
+    def ask(self, *request: Any) -> dict[str, Any]:
+        answer = super().ask(*request)
+        self.answers[next(iter(answer))] += 1
+        return answer
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{count} {answer}" for answer, count in self.answers.most_common())
+        return f"{self.answers.total()} files: {counts}; started {self.starts} times"
+
+
+def child() -> Child:
     """Runs this file."""
-    return probe.Process([sys.executable, __file__], SECONDS)
+    return Child()
 
 
 def note(event: str, arguments: tuple[Any, ...]) -> None:

@@ -23,13 +23,6 @@ from olpm_bench.transport.guide import MIN_PARTICLES, Guide
 from olpm_bench.transport.settings import InputError
 from representations.interface import ParticleBatch
 
-
-@pytest.fixture(scope="module")
-def process():
-    with child() as process:
-        yield process
-
-
 GUIDES = {"jensen": {"type": "jensen", "resolution": 2}, "hey": {"type": "hey", "cones": 4},
           "gaussian_mixture": {"type": "gaussian_mixture", "components": 2}}        # all but the first with parallax
 HALVES = ("a.mean", "b.mean", "a.variance", "b.variance")       # of a reference
@@ -56,6 +49,16 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     write_exr(folder / "image.exr", {"mean": rng.uniform(size=(6, 8, 3)).astype(np.float32), "count": np.ones((6, 8))}, {"a": 1})
     write_exr(folder / "halves.exr", {name: rng.uniform(size=(6, 8, 3)) for name in HALVES}, {"spp_a": 1, "spp_b": 2})
     return {file.stem: file.read_bytes() for file in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def process(valid, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("last")
+    with child() as process:
+        yield process
+        for name, content in valid.items():
+            assert judge(process, folder, name, content) == "ok", "after so many files it refuses whole ones"
+        print(process)              # pytest -rP shows it
 
 
 def judge(process, folder: Path, kind: str, content: bytes) -> str:

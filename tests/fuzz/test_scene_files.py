@@ -53,13 +53,6 @@ OBJ = b"v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 1\nvn 0 0 1\nf 1/1/
 
 
 @pytest.fixture(scope="module")
-def process():
-    with child() as process:
-        yield process
-        print(f"Mitsuba was killed {process.starts - 1} times")        # pytest -s shows it
-
-
-@pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     import numpy as np
 
@@ -119,6 +112,14 @@ def judge(process, folder: Path, xml: bytes, kind: str = "scene") -> str:
     assert kind == "scene" or "died" not in answer or "died" in process.ask("scene", str(folder / "scene.xml")), answer
     assert files() == before
     return next(iter(answer))
+
+
+@pytest.fixture(scope="module")
+def process(folder):
+    with child() as process:
+        yield process
+        assert judge(process, folder, XML.encode()) == "ok", "after so many files it refuses a whole one"
+        print(process)              # pytest -rP shows it; each start but the first follows a death of Mitsuba
 
 
 @example(xml=XML.replace('"reflectance"><string name="filename"', '"reflectance"><string name="file"').encode()).via(

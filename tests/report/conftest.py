@@ -37,5 +37,5 @@ def finished(tmp_path) -> Finished:
                            {"mean": images[-1], "variance": truth, "count": truth[..., 0]}, images)
     results.write_json("env.json", {"schema_version": 1, "cpu": "Abacus 2", "threads": 2})
     a, b = (truth + rng.normal(0, 0.005, truth.shape).astype(np.float32) for _ in range(2))
-    reference = Reference(a, b, truth, truth, {"spp_a": 1, "spp_b": 1})
+    reference = Reference(a, b, truth, truth, {"spp_a": 600, "spp_b": 700, "seconds": 299.5, "estimator": "path, unguided"})
     return read(experiment, results, {"door_ajar": reference})

@@ -104,6 +104,14 @@ def test_the_viewer_is_given_the_stored_pixels(finished):
     assert {tmo["activeTMO"] for tmo in book["initialTMOOverrides"][3:]} == {"falsecolor"}
     assert 2 ** book["initialTMO"]["exposure"] == pytest.approx(block.exposure, rel=0.1)
     assert "of 3 seeds the one with the median L1; 32 \N{MULTIPLICATION SIGN} 18 pixels" in shown["caption"]
+    floor = summary.number(finished.scenes[0].reference.noise_floor)
+    assert shown["caption"].endswith(f"; reference: path, unguided, 1,300 spp, 300 s, L1 of its noise {floor}")
+
+
+def test_the_commands_make_the_reference_in_as_much_time(finished):
+    reference, run_ = page.commands(finished.experiment, finished.results, finished.compared)
+    assert reference.startswith("olpm-bench reference ") and reference.endswith(" --seconds 300") and " run " in run_
+    assert reference in written(finished)
 
 
 def test_large_images_are_packed_and_then_averaged(finished, monkeypatch):

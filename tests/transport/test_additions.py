@@ -4,9 +4,12 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_scenes import RESOLUTION, assert_same_expectation, box, grey, lamp, passes
+from scipy import stats
+from small_scenes import RESOLUTION, assert_same_expectation, box, furnace, grey, lamp, passes
 
 import olpm_bench
+from olpm_bench.check.small_scenes import blocks
+from olpm_bench.check.verdict import sidak
 from olpm_bench.transport import settings
 
 DEPTH = 8
@@ -22,6 +25,7 @@ SWITCHED = {                                # preset, training, integrator
     "a narrow window": ("best", {}, {"window": 20.0}),
     "no camera paths": ("best", {"camera_passes": 0}, {}),
     "one fraction": ("best", {"learn_fraction": False}, {}),
+    "no radiance of camera paths": ("best", {"learn_radiance": False}, {}),
     "direct light not learnt": ("best", {"learn_direct": False}, {}),
     "new records untrained": ("best", {"inherit": False}, {}),
     "no parallax": ("best", {"parallax": False}, {}),
@@ -58,6 +62,20 @@ def test_images_have_the_expectation_of_path(scene, expected, name):
     assert guide.trained > 0.3
     guided = olpm_bench.integrator(guide, preset, max_depth=DEPTH, **integrator)
     assert_same_expectation(passes(scene, guided, N, SPP), expected, 0.01 / len(SWITCHED))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SWITCHED)
+def test_the_furnace_is_even(name):
+    """Everywhere 1 / (1 - albedo), but for the 2^-40 of longer paths."""
+    (preset, changes, integrator), scene = SWITCHED[name], furnace(0.5)
+    amounts = FEW if preset.startswith("paper") else ON
+    guide = olpm_bench.train(scene, preset=preset, max_depth=40, integrator=integrator, **amounts | changes)
+    assert guide.trained > 0.3
+    images = passes(scene, olpm_bench.integrator(guide, preset, max_depth=40, **integrator), N, 16)
+    p = stats.ttest_1samp(blocks(images, 2), 2.0).pvalue
+    p = np.append(p, stats.ttest_1samp(images.mean((1, 2, 3)), 2.0).pvalue)
+    assert np.min(p) >= sidak(0.01 / len(SWITCHED), len(p)), f"mean {images.mean():.6f}"
 
 
 @pytest.mark.slow

@@ -181,9 +181,9 @@ def test_parents_share_the_frame():
 def test_a_full_cache_says_so(monkeypatch):
     monkeypatch.setattr("olpm_bench.transport.cache.MOST_RECORDS", 50)
     cache = RecordCache(mi.ScalarBoundingBox3f((-1, -1, -1.2), (1, 1, 1)), 0.03)
-    with pytest.warns(UserWarning, match="50 records: the rest of the surfaces stays unguided; make record_radius larger"):
-        cache.grow(*_surface(10_000, 0), mi.Bool(True))
-    assert len(cache) == 50
+    assert not cache.full
+    cache.grow(*_surface(10_000, 0), mi.Bool(True))
+    assert cache.full and len(cache) == 50
 
 
 def test_empty_cache_finds_nothing():

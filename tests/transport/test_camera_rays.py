@@ -1,7 +1,9 @@
 """Lanes that take several paths: the same image in expectation, and only where samples need not be told apart."""
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 from small_scenes import assert_same_expectation, box, grey, lamp, passes
 
@@ -32,6 +34,32 @@ def test_many_paths_a_lane_make_the_same_image(sensor, monkeypatch):
     assert guided.paths_a_lane(scene.sensors()[0], 64) == camera_rays.MOST_PATHS
     expected = passes(scene, mi.load_dict({"type": "path", "max_depth": 6}), seed=3000)
     assert_same_expectation(passes(scene, guided), expected)
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_images_do_not_depend_on_the_number_of_threads(guided, monkeypatch):
+    """Of 135 pixels of 768 samples, some are where one thread's share of the lanes ends and another's begins."""
+    monkeypatch.setattr(camera_rays, "FEWEST_LANES", 2**14)
+    scene = _scene(**_film(width=15, height=9))
+    integrator = olpm_bench.integrator(olpm_bench.train(scene, max_depth=6, **SMALL) if guided else None, max_depth=6)
+    assert integrator.paths_a_lane(scene.sensors()[0], 768) == (4 if guided else 1)
+    threads, images = dr.thread_count(), []
+    try:
+        for count in (1, 2, 5):
+            dr.set_thread_count(count)
+            images.append(mi.render(scene, integrator=integrator, spp=768, seed=3).numpy())
+    finally:
+        dr.set_thread_count(threads)
+    assert images[0].min() > 0 and (images[0] == images[1]).all() and (images[0] == images[2]).all()
+
+
+@pytest.mark.parametrize("lanes", [1, 3, 7, 2**15, 2**17, 3 * 2**15])
+def test_sums_of_pixels(lanes):
+    scene = _scene(**_film(width=3, height=2))
+    camera = camera_rays.CameraRays(scene.sensors()[0], lanes, 1)
+    sums, position = camera.sum_pixels(mi.Spectrum(mi.Float(dr.arange(mi.UInt32, 6 * lanes) // lanes)))
+    assert (sums.numpy() == np.arange(6) * lanes).all()
+    assert (position.numpy() == [[0, 1, 2] * 2, [0, 0, 0, 1, 1, 1]]).all()
 
 
 def test_one_path_a_lane_where_samples_must_be_told_apart(monkeypatch):

@@ -14,7 +14,7 @@ from small_scenes import assert_no_kernel_a_pass, box, grey, lamp, wall
 from olpm_bench.check.verdict import sidak
 from olpm_bench.transport import emission
 from olpm_bench.transport.emission import EmissionGuide
-from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
+from olpm_bench.transport.particles import Departures, ParticleRays, Particles, emit_importons, emit_photons, trace
 from olpm_bench.transport.settings import IntegratorSettings
 from olpm_bench.transport.settings import training as with_defaults
 from olpm_bench.transport.training import Training, surface_bounds, train
@@ -203,7 +203,39 @@ def test_memory_is_bounded():
     assert new[-1] < 0.3 * new[0] and records[-1] <= emission.N_KEYS
 
 
+def departures(*x: float, n: int = 5000) -> Departures:
+    """Importons that leave upwards through windows of 10 cm about those x."""
+    rng = np.random.default_rng(len(x))
+    d = rng.normal(size=(3, n)) * 0.1 + np.array([[0], [0], [1]])
+    p = np.stack([np.resize(x, n), np.zeros(n), np.ones(n)]) + rng.uniform(-0.05, 0.05, (3, n))
+    return Departures(mi.Point3f(p), mi.Vector3f(d / np.linalg.norm(d, axis=0)), dr.ones(mi.Float, n), dr.zeros(mi.UInt32, n))
+
+
+def test_another_way_out_is_learnt_when_importons_find_it():
+    """A disk over the first window alone would start no photon above the second."""
+    guide = EmissionGuide(scene := room(sky=light("constant")), surface_bounds(scene), 0.2)
+    guide.learn(departures(-0.8), 0)
+    first = float(guide.guided_radius[0])
+    guide.learn(departures(-0.8), 1)
+    assert float(guide.guided_radius[0]) == first < 0.2
+    guide.learn(departures(0.8, -0.8), 2)
+    assert guide.learnt and float(guide.guided_radius[0]) > 0.7
+    rays = guide.emit(sampler(3))
+    x = (rays.ray.o + rays.ray.d * ((1 - rays.ray.o.z) / rays.ray.d.z)).numpy()        # where they cross the ceiling
+    for window in (-0.8, 0.8):
+        assert np.mean(np.hypot(x[0] - window, x[1]) < 0.1) > 0.2
+    assert_same_mean(mi.luminance(rays.weight).numpy(), mi.luminance(emit_photons(scene, sampler(4)).weight).numpy(), 1)
+
+
 # ---------------------- Nothing to learn ----------------------
+
+def test_each_light_whose_photons_nothing_guides_is_told():
+    """The sky shines into the room, the sun from below the plain."""
+    sun = {**light("directional"), "direction": [0, 0.1, 1]}
+    training = Training(room(sky=light("constant"), sun=sun), "jensen", SMALL, PATHS)
+    told = [message for statistics in training.run() for message in statistics.warnings]
+    assert training.emission.learnt and "too few importons leave towards 1 of 2 lights at infinity" in told[-1]
+
 
 def test_scenes_without_a_light_at_infinity_train_as_ever():
     scene = mi.load_dict(box(grey(0.6), lamp=lamp()))

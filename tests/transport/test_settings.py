@@ -5,13 +5,30 @@ from dataclasses import fields
 
 import pytest
 
-from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, training, with_changes
+from olpm_bench.transport.settings import (
+    InputError,
+    IntegratorSettings,
+    TrainingSettings,
+    integrator,
+    training,
+    with_changes,
+)
 
 
 def test_changes_win_over_the_preset():
     settings = training("paper2014", photons=7)
     assert settings.gather == "nearest" and settings.photons == 7
     assert training() == TrainingSettings()
+
+
+@pytest.mark.parametrize(("preset", "roulette"), [("paper2014", "throughput"), ("paper2014_norr", "none")])
+def test_the_papers_presets_are_the_papers(preset, roulette):
+    """Exact gather of 250 particles, photons and importons only, a fixed half for the BSDF, records of 1 % that shrink."""
+    t = training(preset)
+    assert (t.gather, t.neighbours, t.camera_passes, t.learn_fraction, t.fraction, t.record_radius, t.shrink, t.parallax,
+            t.weight_window, t.schedule) == ("nearest", 250, 0, False, 0.5, 0.01, True, False, "flux", "interleaved")
+    assert integrator(preset).roulette == roulette and integrator(preset).fraction == 0.5
+    assert integrator("best").roulette == "contribution" and training("best").camera_passes > 0
 
 
 @pytest.mark.parametrize("preset", ["slow", ["best"], None])

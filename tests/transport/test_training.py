@@ -103,9 +103,69 @@ def test_shrinking_records_saturate(scene, gather):
 def test_memory_is_constant(scene):
     """The state is no larger after many passes than after a few: nothing of the particles stays, and surfaces fill up."""
     training = Training(scene, "gaussian_mixture", settings.with_changes(SMALL, {"passes": 8, "camera_passes": 8}), PATHS)
-    size = [states.bytes_of(training.radiance.state) for _ in training.run()]
-    assert training.radiance.bytes_per_record < 2048
-    assert size[-1] < 1.02 * size[-8] < 1.1 * size[3]
+    guide, held = training.radiance, []
+    for _ in training.run():
+        cache = sum(value.nbytes for value in guide.cache.to_numpy().values())
+        held.append((states.bytes_of(guide.state), states.bytes_of(guide.estimates), cache, len(guide.cache.table)))
+    assert guide.bytes_per_record < 2048
+    for size in np.array(held).T:
+        assert size[-1] < 1.02 * size[-8] < 1.1 * size[3]
+
+
+def test_camera_paths_may_teach_all_but_where_light_comes_from(scene):
+    """What records return, for the roulette, and how often to sample the BSDF."""
+    changes = {"passes": 1, "camera_passes": 8, "learn_radiance": False}
+    seen, learn = [], settings.with_changes(SMALL, changes)
+    guide = train(scene, "gaussian_mixture", learn, PATHS, on_pass=seen.append)
+    assert seen[0].kept == guide.particles > 10_000 and all(s.kept == 0 and s.stored > 10_000 for s in seen[1:])
+    _, fraction, outgoing, _ = guide.rows.numpy().reshape(-1, 4).T
+    assert np.mean(outgoing > 0) > 0.5 and np.unique(fraction[fraction > 0]).size > 100
+
+
+def test_a_pixel_that_is_not_finite_is_told_and_left_out_of_what_pixels_are_worth(scene, monkeypatch):
+    """As a texture with one such texel makes it: one of them would be in the mean, and so in every pixel's estimate."""
+    training = Training(scene, "jensen", SMALL, PATHS)
+    render = training.integrator.render_paths
+
+    def with_a_hole(*arguments: object) -> mi.TensorXf:
+        image = render(*arguments).numpy()
+        image[3, 4] = np.nan
+        return mi.TensorXf(image)
+
+    monkeypatch.setattr(training.integrator, "render_paths", with_a_hole)
+    told = [message for statistics in training.run() for message in statistics.warnings]
+    assert sum("1 pixels of a training image are NaN or infinite" in message for message in told) == SMALL.camera_passes
+    worth = training.radiance.pixels.values.numpy()
+    assert np.isfinite(worth).all() and worth.min() > 0
+
+
+def test_a_full_cache_is_among_the_warnings(scene, monkeypatch):
+    monkeypatch.setattr("olpm_bench.transport.cache.MOST_RECORDS", 50)
+    told = [statistics.warnings for statistics in Training(scene, "jensen", SMALL, PATHS).run()]
+    assert all(any(m.startswith("50 records, the most there can be: ") for m in messages) for messages in told)
+
+
+def test_another_camera_than_the_first(scene):
+    """One that sees nothing: importons and camera paths are its own."""
+    away = mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at((0, 0, 5), (0, 0, 9), (0, 1, 0))})
+    few = {"passes": 1, "photons": 2_000, "importons": 1_000, "camera_passes": 1, "camera_paths": 1024, "max_depth": DEPTH}
+    with pytest.warns(UserWarning, match="the camera sees no surface"):
+        olpm_bench.train(scene, "cosine", sensor=away, **few)
+
+
+def test_a_guide_that_cannot_be_written_leaves_the_old_one(scene, tmp_path, monkeypatch):
+    guide, path = train(scene, "cosine", settings.with_changes(PARTICLES, {"passes": 1}), PATHS), tmp_path / "guide.npz"
+    guide.save(path)
+    before = path.read_bytes()
+
+    def full(file, **_: object) -> None:
+        file.write(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match="No space left"):
+        guide.save(path)
+    assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == ["guide.npz"]
 
 
 def test_single_batch_is_one_unguided_fit(scene):
