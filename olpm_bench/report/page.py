@@ -86,7 +86,8 @@ def page(found: Finished, rows: Sequence[Mapping[str, Any]], blocks: Sequence[sh
 
 def commands(experiment: Experiment, results: Results, compared: Sequence[FinishedScene]) -> list[str]:
     """What makes these results: the references, if there are any, in as much time as they took, and then the run."""
-    root, seconds = Path(os.path.relpath(results.folder.parent)), [scene.reference.meta.get("seconds", 0) for scene in compared]
+    root = Path(os.path.relpath(results.folder.parent))
+    seconds = [scene.reference.meta.get("seconds", 0) for scene in compared if scene.reference is not None]
     made = [f"{experiment.command('reference', root)} --seconds {math.ceil(max(seconds))}"] if any(seconds) else []
     return [*made, experiment.command("run", root)]
 

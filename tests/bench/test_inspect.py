@@ -115,8 +115,8 @@ def test_methods_are_those_named_or_what_figures_show(tmp_path):
     sweep = 'sweep = { "training.photons" = [1000, 2000, 3000, 4000, 5000, 6000, 7000, 8000, 9000] }\n'
     (tmp_path / "sweep.toml").write_text(TOML + sweep)
     loaded = experiment_file.load(tmp_path / "sweep.toml")
-    assert found() == ["Path tracing", "Cosine, photons 9,000"]
-    assert found("Cosine, photons 2,000") == ["Cosine, photons 2,000"]
+    assert found() == ["Path tracing", "Cosine, photons 9k"]
+    assert found("Cosine, photons 2k") == ["Cosine, photons 2k"]
 
 
 def test_no_link_leads_out_of_the_results_folder(experiment, tmp_path):
