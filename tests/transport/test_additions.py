@@ -73,7 +73,7 @@ def test_the_furnace_is_even(name):
     guide = olpm_bench.train(scene, preset=preset, max_depth=40, integrator=integrator, **amounts | changes)
     assert guide.trained > 0.3
     images = passes(scene, olpm_bench.integrator(guide, preset, max_depth=40, **integrator), N, 16)
-    p = stats.ttest_1samp(blocks(images, 2), 2.0).pvalue
+    p = stats.ttest_1samp(blocks(images, 8), 2.0).pvalue          # of many samples: a narrow window leaves skewed ones
     p = np.append(p, stats.ttest_1samp(images.mean((1, 2, 3)), 2.0).pvalue)
     assert np.min(p) >= sidak(0.01 / len(SWITCHED), len(p)), f"mean {images.mean():.6f}"
 
