@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 MOST_PATHS = 16         # of a lane; more of them save no more
-LANES_AT_ONCE = 2 ** 15  # of a pixel: sums of fewer Dr.Jit does not split between threads
+LANES_AT_ONCE = 2 ** 15  # of a pixel: sums of no more than these Dr.Jit leaves to one thread
 FEWEST_LANES = 2 ** 17  # of an image: cores take 2^14 at a time.  Not by the number of cores, on which no image may depend
 
 
@@ -67,8 +67,7 @@ class CameraRays:
         """
         lanes = self.lanes_a_pixel
         while lanes > 1:
-            block = math.gcd(lanes, LANES_AT_ONCE) if lanes > LANES_AT_ONCE else lanes
-            block = block if block > 1 else lanes
+            block = lanes if lanes <= LANES_AT_ONCE or lanes % 2 else math.gcd(lanes, LANES_AT_ONCE)
             L, lanes = dr.block_sum(L, block, mode="evaluated"), lanes // block
         return L, self._corner(dr.arange(mi.UInt32, self.pixels)) + self.offset
 

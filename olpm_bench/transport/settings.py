@@ -87,7 +87,7 @@ class TrainingSettings:
         paper; off by default: at equal time it costs more than it gains.
     inherit: new records begin with what those beside them have learnt.
     fraction: probability of sampling the BSDF rather than the guide when particles scatter.
-    learn_radiance: from camera paths, learn where light comes from, and not only what records return and the next two.
+    learn_radiance: from camera paths, learn where light comes from, and not only what records return, for the roulette.
     learn_fraction: learn it from camera paths, record by record, for camera paths and importons.
     learn_direct: from camera paths, learn the direct light too that next-event estimation samples more rarely than it brings.
     emission: "guided" starts photons of lights at infinity (constant, envmap, sunsky, directional) where importons leave for
