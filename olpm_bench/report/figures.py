@@ -4,6 +4,7 @@ Reads results, renders nothing.  Colour, marker and dash belong to a method in a
 """
 from __future__ import annotations
 
+import io
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -194,9 +195,20 @@ def save(figure: Figure, folder: Path, name: str) -> list[str]:
     """Write name.png, name.pdf and name.svg; return these names."""
     metadata: dict[str, Any] = {"png": None, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
     for suffix, data in metadata.items():
-        with replacing(folder / f"{name}.{suffix}") as beside:
-            figure.savefig(beside, metadata=data)
+        write(figure, folder / f"{name}.{suffix}", metadata=data)
     return [f"{name}.{suffix}" for suffix in metadata]
+
+
+def write(figure: Figure, path: Path, **options: Any) -> None:
+    """Write one file, its format by its suffix; options as `savefig` has them.
+
+    Raises:
+        OSError: cannot be written.
+    """
+    drawn = io.BytesIO()        # written to a disk that fills up, Matplotlib's PDF raises an AttributeError instead
+    figure.savefig(drawn, format=path.suffix[1:].lower(), **options)
+    with replacing(path) as beside:
+        beside.write_bytes(drawn.getvalue())
 
 
 def caption(found: Finished, trained: bool = False, faint: bool = False) -> str:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench.files import replacing
 from olpm_bench.report import figures, tonemap
 
 if TYPE_CHECKING:
@@ -40,8 +39,7 @@ def records_map(view: RecordView, image: np.ndarray, trained: int, out: Path, ma
         for axes in figure.axes[:3]:
             for pixel in marks:
                 mark(axes, pixel)
-        with replacing(out) as beside:
-            figure.savefig(beside)
+        figures.write(figure, out)
 
 
 def cells(record: np.ndarray, image: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench import metrics, summary
-from olpm_bench.bench.files import replacing
 from olpm_bench.report import figures, tonemap
 
 if TYPE_CHECKING:
@@ -76,8 +75,7 @@ def sheet(found: Finished, blocks: Sequence[Block]) -> list[str]:
         return []
     with figures.style():
         figure = draw(blocks, caption(found))
-        with replacing(found.results.folder / "sheet.png") as beside:
-            figure.savefig(beside, dpi=DPI)
+        figures.write(figure, found.results.folder / "sheet.png", dpi=DPI)
     return ["sheet.png"]
 
 

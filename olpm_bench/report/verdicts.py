@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench.files import replacing
 from olpm_bench.bench.summary import print_whole
 from olpm_bench.report import figures
 
@@ -82,8 +81,7 @@ def picture(panels: Sequence[Panel], title: str, out: Path) -> None:
             a.set_axis_off()
             figure.colorbar(shown, ax=a, location="bottom", fraction=0.05, pad=0.02, aspect=30, label=panel.unit)
         figure.suptitle("\n".join(textwrap.wrap(title, 40 * len(panels))), parse_math=False)
-        with replacing(out) as beside:
-            figure.savefig(beside, dpi=160)
+        figures.write(figure, out, dpi=160)
         plt.close(figure)
 
 

@@ -167,6 +167,21 @@ def test_a_full_disk_leaves_the_last_complete_cell(tmp_path):
     assert any(line.endswith("cell.json,checkpoints.exr,image.exr,trace.jsonl") for line in lines)
 
 
+@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+def test_a_figure_on_a_full_disk_is_an_os_error(tmp_path, suffix):
+    """Matplotlib, writing a PDF by itself, hides it behind an AttributeError."""
+    (folder := tmp_path / "figures").mkdir()
+    draw = ("import sys, pathlib; from matplotlib.figure import Figure; from olpm_bench.report import figures\n"
+            "figure = Figure(); figure.gca().plot(range(9))\n"
+            "try: figures.write(figure, pathlib.Path(sys.argv[1]))\n"
+            "except OSError as error: print(error.strerror)")
+    out = folder / f"figure.{suffix}"
+    done = on_a_disk(f"mount -t tmpfs -o size=4k none {folder}", [sys.executable, "-c", draw, str(out)], tmp_path)
+    if done is None:
+        pytest.skip("there can be no such disk here")
+    assert done.stdout == "No space left on device\n", done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [4, 12, 48, 160])
 def test_commands_on_a_full_disk_say_so_in_a_line(tmp_path, size):
