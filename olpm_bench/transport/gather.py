@@ -6,7 +6,7 @@ Two ways, both deterministic:
   are kept and stand for the others.  One sort, O(1) a particle.
 * `nearest`: each record takes exactly the `neighbours` nearest particles within r_max, as in the paper [L], however small
   its validity radius.
-  Exact to a 2^-24 part of the squared radius; equals are taken in the order of tracing.
+  Exact to a 2^-24 part of the squared radius; equals are taken in a fixed order.
 """
 from __future__ import annotations
 
@@ -14,16 +14,23 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from scipy import ndimage
 
 from olpm_bench.transport import headroom
 from olpm_bench.transport.cache import Grid, RecordCache
 from olpm_bench.transport.particles import Particles
 from olpm_bench.transport.settings import InputError
 from representations.interface import ParticleBatch, group, offsets
+from representations.state import copied, join
 
 MIN_ELEVATION = 1e-3        # dot(d, n): particles that graze the record's horizon are left out [L]
 MIN_COSINE = 0.707          # dot(n', n): and those on surfaces that turn away from it [L]
 DIGIT_BITS, DIGITS = 8, 3   # of the squared distances, for selection by radix
+FARTHEST = 2 ** (DIGIT_BITS * DIGITS) - 1       # the largest of them, just within r_max
+FINEST = 4                  # times that the edge of voxels is halved for records among many particles
+FLAT = 0.35                 # of the particles of 27 voxels, those of a plane within one edge: pi / 9
+AMPLE = 2.0                 # expected particles within an edge / those that a record takes
 
 
 @dataclass(kw_only=True)
@@ -64,19 +71,26 @@ def binned(cache: RecordCache, particles: Particles, neighbours: int, parallax: 
 
 
 def nearest(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
-    """Exactly the `neighbours` nearest particles of each record within r_max."""
-    candidates = _Candidates(cache, particles)
-    # The squared distance of the last neighbour, digit by digit from the highest: counters tell which digit holds it.
-    last, wanted = dr.zeros(mi.UInt32, len(cache)), dr.full(mi.UInt32, neighbours, len(cache))
-    for digit in reversed(range(DIGITS)):
-        shift = dr.opaque(mi.UInt32, digit * DIGIT_BITS)
-        value, wanted = _select_digit(candidates.count_digits(last, shift), wanted)
-        last |= value << shift
-        dr.eval(last, wanted)
-    hit, record = candidates.take(last, wanted, neighbours)
+    """Exactly the `neighbours` nearest particles of each record within r_max.
+
+    A record reads all particles of the 27 voxels around it: among many, those of small voxels, if they hold enough.
+    """
+    hit, record, last = mi.UInt32(), mi.UInt32(), dr.full(mi.UInt32, FARTHEST, len(cache))
+    level, around = _levels(cache, particles, neighbours)
+    for i in range(level.max(initial=0), -1, -1):
+        here = np.flatnonzero(level == i)
+        if len(here) == 0:
+            continue
+        if i > 0 and around[here].sum() < len(particles):       # to sort the particles would cost more than it saves
+            level[here] -= 1
+            continue
+        taken, by, farthest = _Candidates(cache, particles, i, copied(mi.UInt32, here.astype(np.uint32))).nearest(neighbours)
+        hit, record = join(hit, taken), join(record, by)
+        dr.scatter(last, farthest, copied(mi.UInt32, here.astype(np.uint32)))
+        level[here[farthest.numpy() == FARTHEST]] -= 1          # too few within this edge; none are taken
     if len(hit) == 0:
         return _nothing(cache)
-    extent = dr.sqrt((mi.Float(last) + 1) / candidates.to_key)          # r_max where there are not as many
+    extent = dr.sqrt((mi.Float(last) + 1) / _to_key(cache))             # r_max where there are not as many
     by_path = dr.argsort(hit)               # not by voxel: see Particles
     order, record, _ = group(dr.gather(mi.UInt32, record, by_path), len(cache))
     place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, hit, dr.gather(mi.UInt32, by_path, order)))
@@ -120,23 +134,61 @@ def _batch(cache: RecordCache, particles: Particles, place: mi.UInt32, record: m
     return batch
 
 
+def _levels(cache: RecordCache, particles: Particles, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
+    """For each record, how often to halve voxels of r_max so that enough particles are expected within an edge, and how
+    many there are in the 27 around it before [n_records each]."""
+    grid = Grid.over(cache.bbox, cache.radius)
+    count = np.bincount(grid.voxel(particles.read(particles.place)[0]).numpy(), minlength=grid.n_cells // 6)
+    around = ndimage.convolve(count.reshape(grid.size.numpy().ravel()[::-1]), np.ones((3, 3, 3), int), mode="constant").ravel()
+    around = around[grid.voxel(cache.row(dr.arange(mi.UInt32, len(cache)))[0]).numpy()]
+    deepest = np.log2(max(len(particles) / len(count), 1)) / 3              # of as many voxels as there are particles
+    level = 0.5 * np.log2(np.maximum(around * FLAT / (AMPLE * neighbours), 1))
+    return np.minimum(level, min(deepest, FINEST)).astype(int), around
+
+
+def _to_key(cache: RecordCache) -> mi.Float:
+    """What squared distances [scene units squared] are multiplied by and rounded down."""
+    return dr.opaque(mi.Float, (FARTHEST + 1) / cache.radius ** 2)
+
+
 class _Candidates:
-    """Particles sorted by voxel (of one radius), and the records that look for theirs in the 27 voxels around them.
+    """Particles sorted by voxel, and the records that look for theirs in the 27 voxels around them, not farther than an edge.
 
     Three voxels that follow one another along x hold one run of particles: nine runs a record.
+
+    Args:
+        level: the edge of the voxels is r_max / 2^level.
+        record: which records look.
     """
 
-    def __init__(self, cache: RecordCache, particles: Particles) -> None:
+    def __init__(self, cache: RecordCache, particles: Particles, level: int, record: mi.UInt32) -> None:
         p, weight, d, _, n = particles.read(particles.place)
-        grid = Grid.over(cache.bbox, cache.radius)
+        grid = Grid.over(cache.bbox, cache.radius / 2 ** level)
         n_voxels = grid.n_cells // 6
         order, _, self.offset = group(dr.select(weight > 0, grid.voxel(p), dr.opaque(mi.UInt32, n_voxels)), n_voxels)
         self.hit = order
         self.p, self.d, self.n = (dr.gather(type(v), v, order) for v in (p, d, n))
-        self.grid, self.n_records = grid, len(cache)
-        self.record_p, self.record_n, _, _ = cache.row(dr.arange(mi.UInt32, len(cache)))
-        self.to_key = dr.opaque(mi.Float, 2 ** (DIGIT_BITS * DIGITS) / cache.radius ** 2)
+        self.grid, self.record, self.n_records = grid, record, len(record)
+        self.record_p, self.record_n, _, _ = cache.row(record)
+        self.to_key = _to_key(cache)
+        self.edge = dr.opaque(mi.Float, (FARTHEST + 1) / 4 ** level)        # squared, as a key
+        self.whole = level == 0
         dr.eval(self.offset, self.hit, self.p, self.d, self.n, self.record_p, self.record_n)
+
+    def nearest(self, neighbours: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """The `neighbours` nearest particles of each record: hits, their records, and per record the key of the farthest.
+
+        Records with fewer have `FARTHEST`, and take them all within r_max, but none within a smaller edge.
+        """
+        # The squared distance of the last neighbour, digit by digit from the highest: counters tell which digit holds it.
+        last, wanted = dr.zeros(mi.UInt32, self.n_records), dr.full(mi.UInt32, neighbours, self.n_records)
+        for digit in reversed(range(DIGITS)):
+            shift = dr.opaque(mi.UInt32, digit * DIGIT_BITS)
+            value, wanted = _select_digit(self.count_digits(last, shift), wanted)
+            last |= value << shift
+            dr.eval(last, wanted)
+        enough = mi.Bool(True) if self.whole else last < FARTHEST
+        return *self.take(dr.select(enough, last, 0), dr.select(enough, wanted, 0), neighbours), last
 
     def run(self, i: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """First and last + 1 particle of the i-th of the nine runs around each record."""
@@ -152,7 +204,7 @@ class _Candidates:
     def key(self, i: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """Squared distance of particle i from the record, as an integer, and whether the record may use it."""
         d2 = dr.squared_norm(dr.gather(mi.Point3f, self.p, i, active) - self.record_p) * self.to_key
-        ok = active & (d2 < 2 ** (DIGIT_BITS * DIGITS))
+        ok = active & (d2 < self.edge)
         ok &= dr.dot(dr.gather(mi.Vector3f, self.d, i, ok), self.record_n) >= MIN_ELEVATION
         ok &= dr.dot(dr.gather(mi.Normal3f, self.n, i, ok), self.record_n) >= MIN_COSINE
         return mi.UInt32(d2), ok
@@ -196,7 +248,8 @@ class _Candidates:
             run += 1
         dr.eval(slots)
         used = dr.compress(slots != 0xFFFFFFFF)
-        return dr.gather(mi.UInt32, self.hit, dr.gather(mi.UInt32, slots, used)), used // dr.opaque(mi.UInt32, neighbours)
+        by = dr.gather(mi.UInt32, self.record, used // dr.opaque(mi.UInt32, neighbours))
+        return dr.gather(mi.UInt32, self.hit, dr.gather(mi.UInt32, slots, used)), by
 
 
 @dr.syntax

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from olpm_bench.bench import cell, config, experiment_file, run
+from olpm_bench.bench import cell, config, experiment_file, reference_file, run
 from olpm_bench.transport import settings
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments"
@@ -125,9 +125,26 @@ def test_the_first_step_of_progressive_training_differs_in_nothing_but_training(
     assert experiment.integrator_of(experiment.scene[0], plain) == experiment.integrator_of(experiment.scene[0], one)
 
 
-def test_the_committed_reference_keeps_its_key():
-    quickstart = experiment_file.load(FOLDER / "quickstart.toml")
-    assert quickstart.reference_key(quickstart.scene[0]) == "door_ajar-96x54-075c0ded"
+EMBEDDED = [name for name, table in FILES.items() if not any("file" in scene for scene in table["scene"])]
+
+
+@pytest.mark.parametrize("name", EMBEDDED)
+def test_embedded_scenes_come_with_their_reference(name):
+    """At the experiment's resolution, of an unguided estimator, with halves and their variance; a key that moves orphans it."""
+    experiment = experiment_file.load(FOLDER / name)
+    for scene in (scene for scene in experiment.scene if scene.has_reference):
+        path = reference_file.find_reference(experiment.reference_key(scene), [FOLDER.parent / "results" / "references"])
+        assert path is not None, experiment.reference_key(scene)
+        reference = reference_file.read_reference(path, scene.width, scene.height)
+        assert reference.has_halves and reference.mean.shape == (scene.height, scene.width, 3)
+        assert 0 < reference.noise_floor < 0.1 * reference.mean.mean()
+
+
+@pytest.mark.parametrize("name", EMBEDDED)
+def test_claims_say_where_to_look_closer(name):
+    experiment = experiment_file.load(FOLDER / name)
+    for scene in (scene for scene in experiment.scene if scene.has_reference and name not in OWN):
+        assert scene.crops
 
 
 def test_the_ablation_leaves_out_one_addition_at_a_time(tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from small_scenes import box, grey
 
+from olpm_bench.transport import gather
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.gather import MIN_COSINE, MIN_ELEVATION, binned, nearest
 from olpm_bench.transport.particles import emit_photons, trace
@@ -105,3 +106,21 @@ def test_fluence_does_not_depend_on_how_many_are_taken(landed):
     cache, particles = landed
     few, many = (batch.sums().numpy() / batch.reach.numpy() ** 2 for batch in (nearest(cache, particles, n) for n in (60, 240)))
     assert np.median(few / np.maximum(many, 1e-30)) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("neighbours", [20, 60])
+def test_small_voxels_find_the_same_particles(landed, neighbours, monkeypatch):
+    """Most records look in them first, and some of these find too few there."""
+    monkeypatch.setattr(gather, "AMPLE", 0.5)
+    cache, particles = landed
+    level, _ = gather._levels(cache, particles, neighbours)
+    assert np.mean(level > 0) > 0.5
+    fine = nearest(cache, particles, neighbours)
+    monkeypatch.setattr(gather, "FINEST", 0)
+    coarse = nearest(cache, particles, neighbours)
+    np.testing.assert_array_equal(fine.extent.numpy(), coarse.extent.numpy())
+    np.testing.assert_array_equal(fine.record.numpy(), coarse.record.numpy())
+    radius = cache.radius / 2.0 ** level
+    assert np.any(fine.extent.numpy() > radius)
+    swapped = np.any(fine.wo.numpy() != coarse.wo.numpy(), axis=0)
+    assert swapped.mean() < 1e-3        # among particles as far as one another, to the key's resolution
