@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from olpm_bench.transport import headroom
-from olpm_bench.transport.cache import Grid, RecordCache
+from olpm_bench.transport.cache import MOST_CELLS, Grid, RecordCache
 from olpm_bench.transport.particles import Particles
 from olpm_bench.transport.settings import InputError
 from representations.interface import ParticleBatch, group, offsets
@@ -141,7 +141,8 @@ def _levels(cache: RecordCache, particles: Particles, neighbours: int) -> tuple[
     count = np.bincount(grid.voxel(particles.read(particles.place)[0]).numpy(), minlength=grid.n_cells // 6)
     around = ndimage.convolve(count.reshape(grid.size.numpy().ravel()[::-1]), np.ones((3, 3, 3), int), mode="constant").ravel()
     around = around[grid.voxel(cache.row(dr.arange(mi.UInt32, len(cache)))[0]).numpy()]
-    deepest = np.log2(max(len(particles) / len(count), 1)) / 3              # of as many voxels as there are particles
+    most = min(len(particles), MOST_CELLS // 6)         # voxels
+    deepest = np.log2(max(most / len(count), 1)) / 3
     level = 0.5 * np.log2(np.maximum(around * FLAT / (AMPLE * neighbours), 1))
     return np.minimum(level, min(deepest, FINEST)).astype(int), around
 
