@@ -84,9 +84,10 @@ def nearest(cache: RecordCache, particles: Particles, neighbours: int, parallax:
         if i > 0 and around[here].sum() < len(particles):       # to sort the particles would cost more than it saves
             level[here] -= 1
             continue
-        taken, by, farthest = _Candidates(cache, particles, i, copied(mi.UInt32, here.astype(np.uint32))).nearest(neighbours)
+        served = copied(mi.UInt32, here.astype(np.uint32))
+        taken, by, farthest = _Candidates(cache, particles, i, served).nearest(neighbours)
         hit, record = join(hit, taken), join(record, by)
-        dr.scatter(last, farthest, copied(mi.UInt32, here.astype(np.uint32)))
+        dr.scatter(last, farthest, served)
         level[here[farthest.numpy() == FARTHEST]] -= 1          # too few within this edge; none are taken
     if len(hit) == 0:
         return _nothing(cache)
