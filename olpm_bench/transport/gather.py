@@ -84,6 +84,8 @@ def nearest(cache: RecordCache, particles: Particles, neighbours: int, parallax:
         if i > 0 and around[here].sum() < len(particles):       # to sort the particles would cost more than it saves
             level[here] -= 1
             continue
+        if level.any():
+            dr.flush_malloc_cache()         # of many particles, each array is a part of the machine's memory
         served = copied(mi.UInt32, here.astype(np.uint32))
         taken, by, farthest = _Candidates(cache, particles, i, served).nearest(neighbours)
         hit, record = join(hit, taken), join(record, by)
