@@ -140,11 +140,9 @@ def test_embedded_scenes_come_with_their_reference(name):
         assert 0 < reference.noise_floor < 0.1 * reference.mean.mean()
 
 
-@pytest.mark.parametrize("name", EMBEDDED)
+@pytest.mark.parametrize("name", sorted(set(EMBEDDED) - OWN - {"slit.toml"}))      # which shows no images
 def test_claims_say_where_to_look_closer(name):
-    experiment = experiment_file.load(FOLDER / name)
-    for scene in (scene for scene in experiment.scene if scene.has_reference and name not in OWN):
-        assert scene.crops
+    assert all(scene.has_reference and scene.crops for scene in experiment_file.load(FOLDER / name).scene)
 
 
 def test_the_ablation_leaves_out_one_addition_at_a_time(tmp_path):
