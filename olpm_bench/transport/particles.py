@@ -75,6 +75,10 @@ class Particles:
         p, d, n = (dr.gather(mi.Vector4f, a, place) for a in (self.position, self.direction, self.normal))
         return mi.Point3f(p.x, p.y, p.z), p.w, mi.Vector3f(d.x, d.y, d.z), d.w, mi.Normal3f(n.x, n.y, n.z)
 
+    def one_of(self, n: int) -> Particles:
+        """One hit in n, evenly along the paths."""
+        some = dr.arange(mi.UInt32, -(-len(self) // n)) * dr.opaque(mi.UInt32, n)
+        return dataclasses.replace(self, place=dr.gather(mi.UInt32, self.place, some))
 
     def by_region(self, region: Callable[[np.ndarray], np.ndarray], n: int) -> np.ndarray:
         """Hits in each of n regions, and their effective number (sum w)^2 / sum w^2 [n, 2].

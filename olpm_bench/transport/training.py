@@ -36,7 +36,8 @@ from olpm_bench.transport.window import by_contribution
 from representations.interface import ParticleBatch
 
 LITTLE = 0.05       # share of what the camera sees that is guided, below which `train` warns
-SETTLE = 3          # gathers from which the records of a single batch find their radii, as on-line in as many passes
+SETTLE = 3          # gathers from which the records of a single batch find their radii, as on-line in as many passes, ...
+ONE_OF = 4          # ... each of one particle in so many, with as many fewer neighbours
 
 
 @dataclass
@@ -258,9 +259,10 @@ class Training:
         if len(particles) == 0:             # nothing of this pass has reached a second surface
             return 0
         if self.settings.shrink and self.settings.schedule == "single_batch":
+            some, fewer = particles.one_of(ONE_OF), max(1, self.settings.neighbours // ONE_OF)
             for _ in range(SETTLE):         # there is no next pass in which records could be smaller
-                guide.measure(self._gather(guide, particles, statistics))
-        batch = self._gather(guide, particles, statistics)
+                guide.measure(self._gather(guide, some, fewer, statistics))
+        batch = self._gather(guide, particles, self.settings.neighbours, statistics)
         with _Seconds(statistics, "update"):
             if len(batch):
                 guide.learn_fluence(batch, emitted)
@@ -269,7 +271,7 @@ class Training:
                 guide.measure(batch)
         return len(batch)
 
-    def _gather(self, guide: Guide, particles: Particles, statistics: PassStatistics) -> Gathered:
+    def _gather(self, guide: Guide, particles: Particles, neighbours: int, statistics: PassStatistics) -> Gathered:
         """The particles of each record, when records have shrunk to what the last batch asked for, and new ones are added."""
         with _Seconds(statistics, "grow"):
             p, weight, _, _, n = particles.read(particles.place)
@@ -277,7 +279,7 @@ class Training:
                 guide.shrink()
             self._grow(guide, p, n, weight > 0, statistics)
         with _Seconds(statistics, "gather"):
-            return GATHERS[self.settings.gather](guide.cache, particles, self.settings.neighbours, self.settings.parallax)
+            return GATHERS[self.settings.gather](guide.cache, particles, neighbours, self.settings.parallax)
 
     def _grow(self, guide: Guide, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, statistics: PassStatistics) -> None:
         guide.grow(p, n, active, self._next_seed())

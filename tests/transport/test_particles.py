@@ -126,3 +126,10 @@ def test_particles_by_region():
     p[:, 0], p[:, 3] = [-1, -1, 1, 1, 1, 1], [1, 1, 1, 1, 1, 0]
     hits = Particles(mi.Float(p.ravel()), mi.Float(p.ravel()), mi.Float(p.ravel()), dr.arange(mi.UInt32, 6), 6)
     np.testing.assert_allclose(hits.by_region(lambda p: (p[:, 0] > 0).astype(int), 2), [[2, 2], [4, 3]])
+
+
+@pytest.mark.parametrize("n, places", [(1, [7, 3, 5, 1, 9]), (2, [7, 5, 9]), (4, [7, 9]), (100, [7])])
+def test_one_of_so_many(n, places):
+    nothing = mi.Float()
+    hits = Particles(nothing, nothing, nothing, mi.UInt32([7, 3, 5, 1, 9]), 1)
+    assert hits.one_of(n).place.numpy().tolist() == places
