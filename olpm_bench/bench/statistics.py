@@ -155,7 +155,7 @@ def jackknife(statistic: Callable[[np.ndarray], float], n: int, confidence: floa
         return Interval(value, float("nan"), float("nan"))
     with np.errstate(invalid="ignore", divide="ignore"):
         without = np.log([statistic(np.delete(seeds, i)) for i in seeds])
-    reach = np.exp(special.stdtrit(n - 1, confidence) * np.sqrt((n - 1) * np.var(without)))
+        reach = np.exp(special.stdtrit(n - 1, confidence) * np.sqrt((n - 1) * np.var(without)))
     return Interval(value, float(value / reach), float(value * reach))
 
 
