@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import drjit as dr
 import psutil
 
 from olpm_bench.transport.settings import InputError
@@ -29,5 +30,7 @@ def require(needed: float, what: str, remedy: str) -> None:
     Raises:
         InputError: there is less.
     """
+    if needed > free():
+        dr.flush_malloc_cache()         # Dr.Jit keeps what arrays have left, for others
     if needed > (there := free()):
         raise InputError(f"{what} take about {needed / 1e9:.2g} GB, and {there / 1e9:.2g} GB are free: {remedy}")

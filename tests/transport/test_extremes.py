@@ -4,8 +4,10 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+import psutil
 import pytest
 from small_scenes import assert_same_expectation, box, grey, lamp, passes, wall
 
@@ -156,3 +158,16 @@ def test_the_memory_of_a_container_counts(tmp_path, monkeypatch):
     assert headroom.free() > 0.5 * machine
     (tmp_path / "memory.max").write_text("4000\n")
     assert headroom.free() == 3300
+
+
+def test_memory_that_arrays_have_left_is_free(monkeypatch):
+    """Dr.Jit keeps it: a sweep whose largest cell was first would be refused all others."""
+    machine = psutil.Process().memory_info().rss + 3e8
+    monkeypatch.setattr(headroom, "free", lambda: machine - psutil.Process().memory_info().rss)
+    large = dr.arange(mi.Float, 50_000_000)
+    dr.eval(large)
+    dr.sync_thread()
+    with pytest.raises(InputError, match=r"an array take about 0\.2 GB, and"):
+        headroom.require(2e8, "an array", "wait")
+    del large
+    headroom.require(2e8, "an array", "wait")
