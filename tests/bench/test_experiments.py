@@ -72,6 +72,14 @@ def test_the_talks_method_and_its_modern_version_stand_side_by_side(tmp_path, na
         assert experiment.integrator_of(scene, method) == settings.integrator(preset)
 
 
+def assert_is_of(preset, experiment, method, *others):
+    """A method is that of a preset, but for amounts, and perhaps for other settings."""
+    training, wanted = experiment.training_of(method), settings.training(preset)
+    for key in {"gather", "record_radius", "shrink", "camera_passes", "learn_fraction", "weight_window", "parallax"} - {*others}:
+        assert getattr(training, key) == getattr(wanted, key), key
+    assert experiment.integrator_of(experiment.scene[0], method) == settings.integrator(preset)
+
+
 @pytest.mark.parametrize("name", ["progressive_training.toml", "interleaving.toml", "emission.toml"])
 @pytest.mark.parametrize("scale", [None, "small"])
 def test_methods_name_their_preset(tmp_path, name, scale):
@@ -79,12 +87,21 @@ def test_methods_name_their_preset(tmp_path, name, scale):
     presets = set()
     for method in (m for m in experiment.method if m.representation):
         preset = next(preset for preset in settings.PRESETS if preset in method.name.split(", "))
-        training, wanted = experiment.training_of(method), settings.training(preset)
-        for key in ("gather", "record_radius", "shrink", "camera_passes", "learn_fraction", "weight_window", "parallax"):
-            assert getattr(training, key) == getattr(wanted, key)
-        assert experiment.integrator_of(experiment.scene[0], method) == settings.integrator(preset)
+        assert_is_of(preset, experiment, method)
         presets.add(preset)
     assert presets == set(settings.PRESETS)
+
+
+@pytest.mark.parametrize("name", ["single_batch.toml", "single_batch_time.toml", "memory.toml"])
+@pytest.mark.parametrize("scale", [None, "small"])
+def test_titles_name_the_preset_of_all_methods_but_the_modern_version(tmp_path, name, scale):
+    experiment = of_this_project(tmp_path, name, scale)
+    assert "(paper2014_norr)" in experiment.title
+    *others, modern = (m for m in experiment.method if m.representation)
+    for method in others:
+        assert_is_of("paper2014_norr", experiment, method, *(["shrink"] if name == "memory.toml" else []))
+    assert modern.name == "GMM, best"
+    assert_is_of("best", experiment, modern)
 
 
 @pytest.mark.parametrize("name", ["single_batch.toml", "single_batch_time.toml"])

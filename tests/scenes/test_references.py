@@ -18,6 +18,7 @@ from olpm_bench.scenes.load import load
 FOLDER = Path(__file__).resolve().parents[2] / "results" / "references"
 FOUND = {path.parent.name: json.loads(path.read_text()) for path in sorted(FOLDER.glob("*/meta.json"))}
 EMBEDDED = {key: meta for key, meta in FOUND.items() if meta["scene"] in scenes.names()}
+# The classroom's sky is an easy light beside its sun, for guided emission: 19,000 samples.
 HARD = {key: meta for key, meta in EMBEDDED.items() if meta["scene"] != "cornell_box" and not meta["parameters"].get("sky")}
 SIZE = 18                   # of blocks, in pixels along each side: so large that t-tests bear their skewness
 
