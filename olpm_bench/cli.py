@@ -4,6 +4,7 @@ Exit codes: 0 all is complete; 1 a cell failed or is missing; 2 bad input; 130 i
 """
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import signal
@@ -73,6 +74,11 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
             if isinstance(error, NotImplementedError | RecursionError):
                 raise
             complain(reason(error))         # of Mitsuba or Dr.Jit, or an image that cannot be used
+            raise typer.Exit(FAILED) from None
+        except SystemExit as error:
+            if error.code:
+                raise
+            complain("code that is not ours has ended the process, as if all were well")
             raise typer.Exit(FAILED) from None
         except OSError as error:
             complain(": ".join(str(p) for p in (error.filename, error.strerror or error) if p))
@@ -401,7 +407,7 @@ def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CL
           declare: Annotated[list[str], typer.Option(metavar="constant|grows", help="On purpose, it learns nothing, or keeps all "
                                                      "particles.")] = [],  # noqa: B006
           only: Annotated[list[str], typer.Option(metavar="CHECK", help="Leave out all other checks.")] = [],  # noqa: B006
-          seed: Annotated[int, typer.Option(min=0)] = 0,
+          seed: Annotated[int, typer.Option(min=0, max=1 << 24)] = 0,
           repeat: Annotated[int, typer.Option(min=1, help="Run with so many seeds, and count the false alarms.")] = 1,
           log: Annotated[Path | None, typer.Option(metavar="FILE", help="Each run adds a line of JSON; seeds that it has are not "
                                                    "run again, and count.")] = None,
@@ -419,10 +425,11 @@ def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CL
     experiment_file.announce(representation)
     specification = {"type": representation, **settings(set_, ("representation",))["representation"]}
     checks, subject = suite.named(only), suite.Subject(specification, seed, declare)
-    if repeat > 1 or log:
-        found = examination.campaign(subject, checks, repeat, pictures, quiet=json_, log=log)
-    else:
-        found = examination.examine(subject, checks, pictures, quiet=json_)
+    with contextlib.redirect_stdout(sys.stderr) if json_ else contextlib.nullcontext():         # what its own code may print
+        if repeat > 1 or log:
+            found = examination.campaign(subject, checks, repeat, pictures, quiet=json_, log=log)
+        else:
+            found = examination.examine(subject, checks, pictures, quiet=json_)
     if json_:
         print(json.dumps(plain(found), allow_nan=False))
     if not found["passed"]:

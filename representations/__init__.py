@@ -60,7 +60,7 @@ def find(name: str) -> Any:
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
         try:
             return entry.load()
-        except Exception as error:      # other people's code
+        except (Exception, SystemExit) as error:        # other people's code
             raise RepresentationError(f"representation '{name}', entry point {entry.value}, {_reason(error)}") from error
     if (found := file_of(name)) is not None:
         return _from_file(*found)
@@ -89,7 +89,7 @@ def create(type: str, **parameters: Any) -> Any:
         raise
     except (TypeError, ValueError) as error:
         raise RepresentationError(f"representation '{type}': {error}") from error
-    except Exception as error:          # other people's code
+    except (Exception, SystemExit) as error:            # other people's code
         if type in BUILT_IN:
             raise
         raise RepresentationError(f"representation '{type}' {_reason(error)}") from error
@@ -123,7 +123,7 @@ def _from_file(file: Path, attribute: str) -> type:
     sys.modules[module_name] = module           # dataclasses look their module up by name
     try:
         spec.loader.exec_module(module)
-    except Exception as error:                  # other people's code
+    except (Exception, SystemExit) as error:    # other people's code, which may even say that all is well
         sys.modules.pop(module_name, None)
         raise RepresentationError(f"representation file {file} {_reason(error)}") from error
     if not inspect.isclass(getattr(module, attribute, None)):

@@ -46,6 +46,8 @@ def load(path: Path | str, scenes: dict[str, Path] | None = None, scale: str | N
     if path.stem.strip(".").lower() in ("", RESERVED):
         raise ConfigError(f"experiment file {path}: its results would go to the folder {path.stem!r}; give it another name")
     try:
+        if path.exists() and not path.is_file():
+            raise OSError("no regular file")        # some never end
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"experiment file {path}: there is no such file") from None

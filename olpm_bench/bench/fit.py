@@ -108,7 +108,7 @@ def _integral(representation: DirectionalPdf[Any], state: Any) -> float:
 
 
 def _load(file: Path, *names: str) -> list[np.ndarray]:
-    """Arrays of an .npz file, checked and as float64."""
+    """Arrays of an .npz file, checked and as float64; weights over the largest."""
     if not Path(file).is_file():
         raise InputError(f"{file}: there is no such file")
     archive = npz.read(file)
@@ -130,7 +130,7 @@ def _load(file: Path, *names: str) -> list[np.ndarray]:
         if name != "wo" and array.min() < 0:
             raise InputError(f"{file}: array '{name}' has {np.count_nonzero(array < 0)} negative entries")
     by_name = dict(zip(names, arrays, strict=True))
-    if by_name["weight"].sum() <= 0:
+    if not by_name["weight"].any():
         raise InputError(f"{file}: array 'weight' is zero everywhere")
     wo = by_name["wo"]
     stray = np.abs(np.linalg.norm(wo, axis=1) - 1) > 1e-3
@@ -139,4 +139,5 @@ def _load(file: Path, *names: str) -> list[np.ndarray]:
     if wo[:, 2].min() <= 0:
         below = np.count_nonzero(wo[:, 2] <= 0)
         raise InputError(f"{file}: array 'wo' has {below} directions below the horizon; must have z > 0")
-    return arrays
+    largest = by_name["weight"].max()           # only ratios matter, and sums of large ones overflow
+    return [array / largest if name == "weight" else array for name, array in by_name.items()]

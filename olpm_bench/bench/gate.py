@@ -2,7 +2,8 @@
 
 Seeds are paired.  The ratio of two errors is the geometric mean over seeds of the paired ratios, bounded from above by a
 bootstrap over seeds; that of two variances is of all seeds together, bounded by a jackknife.  A claim holds if that bound does
-not exceed what it states, and so never for a lack of data.  All claims must hold, which needs no correction for their number.
+not exceed what it states, and so never for a lack of data; nor where the mean images of the two differ: who is biased is not
+better.  All claims must hold, which needs no correction for their number.
 """
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from olpm_bench.bench.config import Claim, ConfigError, Experiment
 from olpm_bench.bench.files import SCHEMA_VERSION
 from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Cell, Results
-from olpm_bench.bench.summary import complete_cells, number, print_whole, work
+from olpm_bench.bench.summary import APART, apart, complete_cells, number, print_whole, work
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,16 +27,22 @@ LEAST_SEEDS = 8
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim in one scene: the measured ratio, and the bounds that it keeps with the claim's confidence each."""
+    """A claim in one scene: the measured ratio, the bounds that it keeps with the claim's confidence each, and by how many
+    standard errors the two mean images differ."""
     scene: str
     claim: Claim
     ratio: float
     low: float
     high: float
+    apart: float = 0.0
 
     @property
     def holds(self) -> bool:
-        return self.high <= self.claim.ratio        # not for NaN
+        return self.high <= self.claim.ratio and self.apart <= APART        # not for NaN
+
+    def __str__(self) -> str:
+        biased = f": the means are {self.apart:.0f} standard errors apart" if self.apart > APART else ""
+        return "holds" if self.holds else f"FAILS{biased}"
 
     def as_dict(self) -> dict[str, Any]:
         return {**self.claim.model_dump(exclude={"ratio"}), "claimed": self.claim.ratio, "holds": self.holds,
@@ -72,7 +79,7 @@ def judge(experiment: Experiment, results: Results, references: dict[str, Refere
         for scene in experiment.scene:
             better, worse = cells[scene.name, claim.better], cells[scene.name, claim.worse]
             ratio = _ratio(claim, better, worse, references.get(scene.name))
-            verdicts.append(Verdict(scene.name, claim, ratio.value, ratio.low, ratio.high))
+            verdicts.append(Verdict(scene.name, claim, ratio.value, ratio.low, ratio.high, apart(better, worse)))
     return verdicts
 
 
@@ -114,5 +121,5 @@ def print_verdicts(verdicts: list[Verdict], console: Console | None = None) -> N
         claim = f"{v.claim.metric} of {v.claim.better} <= {v.claim.ratio:g} x that of {v.claim.worse}"
         bounds = f"{number(v.low)}-{number(v.high)} ({v.claim.confidence:.3g} each)"
         table.add_row(Text(v.scene), Text(claim), number(v.ratio), bounds,
-                      Text("holds" if v.holds else "FAILS", style="green" if v.holds else "bold red"))
+                      Text(str(v), style="green" if v.holds else "bold red"))
     print_whole(table, console or Console())

@@ -105,13 +105,12 @@ def warnings(infos: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _digests(info: dict[str, Any], folder: Path) -> dict[str, str]:
-    """What cell.json says of itself and of the files beside it.  Its key is compared with the experiment's instead.
+    """What cell.json says of itself and of the files beside it.
 
     Raises:
         ResultError: one is missing.
     """
-    measured = {name: value for name, value in info.items() if name != "key"}
-    found = {"cell.json": digest(json.dumps(measured, sort_keys=True).encode())}
+    found = {"cell.json": digest(json.dumps(info, sort_keys=True).encode())}
     for name in ("trace.jsonl", "image.exr", "checkpoints.exr"):
         try:
             found[name] = digest((folder / name).read_bytes())
@@ -167,8 +166,6 @@ class Results:
     def read_cell(self, scene: str, method: str, seed: int, size: tuple[int, int] | None = None) -> Cell | None:
         """The cell if it is complete, else None.
 
-        Older cells have no digests of their images, or none at all: those are believed.
-
         Args:
             size: (height, width) that its images must have.
 
@@ -183,11 +180,11 @@ class Results:
         digests = info.pop("digests", None)
         if not isinstance(digests, dict):
             raise ResultError(f"{folder / 'cell.json'} is broken: it has no digests")
-        if digests:
-            found = _digests(info, folder)
-            for name, said in digests.items():
-                if said != found.get(name):
-                    raise ResultError(f"{folder / name} is broken: its digest is another")
+        for name, found in _digests(info, folder).items():
+            if found != digests.get(name):
+                raise ResultError(f"{folder / name} is broken: its digest is another")
+        if (info.get("scene"), info.get("method"), info.get("seed")) != (scene, method, seed):
+            raise ResultError(f"{folder / 'cell.json'} is of another cell")
         try:
             lines = (folder / "trace.jsonl").read_text(encoding="utf-8").splitlines()
             trace = [json.loads(line) for line in lines if line.strip()]

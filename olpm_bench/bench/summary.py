@@ -18,6 +18,7 @@ from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
 from olpm_bench.bench.reference_file import NEAR_FLOOR
 from olpm_bench.bench.results import Cell, Results, warnings
 
+APART = 6.0                 # standard errors between the mean images of two methods, beyond which that is said
 LATE = 0.05                 # share of a budget in seconds by which a cell may exceed it, before that is said
 SLOWER = 0.95               # `worst_speed_up` below which that is said
 
@@ -66,9 +67,9 @@ def summarise(finished: Finished) -> dict[str, Any]:
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
     `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, and `overrun` is the
     largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.  `gain` is the
-    baseline's work-normalised variance over the method's, with its 90 % jackknife interval, and `worst_speed_up` by
-    `statistics.worst_speed_up`; `warnings` are those of training.  What has no value (a spread of one seed, the error of a scene
-    without reference) is None.
+    baseline's work-normalised variance over the method's, with its 90 % jackknife interval, `worst_speed_up` by
+    `statistics.worst_speed_up`, and `apart` by `apart` from the baseline; `warnings` are those of training.  What has no value
+    (a spread of one seed, the error of a scene without reference) is None.
     """
     budget = finished.experiment.budget.seconds
     rows = [_row(scene, method, budget) for scene in finished.scenes for method in scene.cells]
@@ -79,6 +80,20 @@ def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work
     """What the cells of a method (one per seed) show and cost; `images` are theirs."""
     seconds = np.array([cell.info["charged_seconds"] for cell in cells], np.float64)
     return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
+
+
+def apart(a: Sequence[Cell], b: Sequence[Cell]) -> float:
+    """By how many standard errors the mean images of two methods differ; of the errors by pixels and over seeds, the larger.
+
+    Of images of so few samples that they don't know their error, that of pixels is infinite.
+    """
+    def mean(cells: Sequence[Cell]) -> tuple[float, float]:
+        means, errors = (np.array([cell.info[key] for cell in cells], np.float64) for key in ("mean", "mean_stderr"))
+        by_pixels = np.sqrt(np.mean(np.where(np.isnan(errors), np.inf, errors) ** 2))
+        over_seeds = np.std(means, ddof=1) if len(cells) > 1 else 0.0
+        return float(means.mean()), float(max(by_pixels, over_seeds) / np.sqrt(len(cells)))
+    (x, x_error), (y, y_error) = mean(a), mean(b)
+    return abs(x - y) / max(np.hypot(x_error, y_error), np.finfo(float).tiny)
 
 
 def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, Any]:
@@ -103,6 +118,7 @@ def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, A
         "bytes_per_record": _whole(np.median(info["bytes_per_record"])),
         "particles": _whole(np.median(info["particles"])),
         "worst_speed_up": scene.worst_speed_ups.get(method),
+        "apart": apart(cells, scene.cells[scene.baseline]),
         "noise_floor": scene.reference.noise_floor if scene.reference is not None else None,
         "warnings": warnings([cell.info for cell in cells]),
     })
@@ -169,7 +185,8 @@ def print_metrics(summary: dict[str, Any], console: Console | None = None) -> No
 
 
 def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What is to be known of the cells of a table's rows: that they waited, took long, had to warn, or were overtaken."""
+    """What is to be known of the cells of a table's rows: that they waited, took long, had to warn, were overtaken, or
+    differ in the mean."""
     found = []
     for row in rows:
         said = list(row["warnings"])
@@ -181,6 +198,9 @@ def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             said.append(f"its L1 error is only {row['l1'] / row['noise_floor']:.2g} times the reference's noise, a part of it")
         if row["worst_speed_up"] is not None and row["worst_speed_up"] < SLOWER:
             said.append(f"{row['worst_speed_up']:.2g}x as fast as the baseline to the L1 error where it compares worst")
+        if row["apart"] > APART:
+            said.append(f"its mean image is {row['apart']:.0f} standard errors from the baseline's: one of the two is biased, or "
+                        "has too few samples to know its error")
         found += [f"{row['scene']} / {row['method']}: {words}" for words in said]
     return found
 

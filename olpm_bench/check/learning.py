@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -12,16 +13,18 @@ from scipy import stats
 from olpm_bench.check.particles import Particles, batch, equal, uniform_directions, vector
 from olpm_bench.check.picture import of_density, over_disk
 from olpm_bench.check.trained import as_numpy
-from olpm_bench.check.verdict import Panel, Picture, PValues, Verdict
+from olpm_bench.check.verdict import Panel, Picture, PValues, Verdict, sidak, worst_of
 from representations.square import to_hemisphere
 
 COUNTS = (100, 1_000, 10_000)       # particles of a record
 PARTS = 10                  # on-line batches of the second count
 REPLICATES = 8              # records that learn the same density from particles of their own
 HELD_OUT = 2_000            # directions of each density
-LEAST = 0.02                # nats that each `HARD` density must gain over the untrained one, and by right weights over wrong ones
+LEAST = 0.02                # nats that each `HARD` density must gain over the untrained one, and all on average by their weights
 MORE = 0.05                 # nats that one of them must gain by both halves over either; ours gain 0.27, a single Gaussian 0.09
-LIGHT = 0.1                 # weight of the light ones among particles and decoys; the others weigh 1
+LIGHT = 0.1                 # weight of decoys, of which there are 1 / LIGHT as many as particles; those weigh 1
+LITTLE = 0.1                # of the cosine in q where weights are judged: more would do for the decoys
+ASIDE = 0.05                # deviation of the points from which states with parallax are asked [scene units]
 SLACK = 0.05                # nats that more particles may lose: some keep a part of them, and kernels become narrower
 
 
@@ -51,10 +54,17 @@ HARD = [name for name in DENSITIES if name != "wide"]       # that a cosine does
 
 
 def learn(representation: Any, seed: int, constant: bool, level: float) -> Verdict:
+    """As `learn_known`, without and with parallax, of light that is infinitely far."""
+    return worst_of({"with parallax" if parallax else "": learn_known(representation, seed, constant, parallax, sidak(level, 2))
+                     for parallax in (False, True)})
+
+
+def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, level: float) -> Verdict:
     """Mean ln q of held-out directions, q = (cos / pi + pdf) / 2 as a path tracer uses it, rises with the number of particles.
 
     All of them count: directions of the left half of a density, then of the right half, in one batch or in many, teach more than
-    either half.  So do their weights: among uniform decoys, the right ones teach more than those of the decoys in their place.
+    either half.  So do their weights: of particles and more, but lighter uniform decoys, the density is half of either, and the
+    weights teach that, not their square roots or squares.
 
     `constant`: declared to learn nothing.
     """
@@ -63,59 +73,69 @@ def learn(representation: Any, seed: int, constant: bool, level: float) -> Verdi
     particles = np.stack([DENSITIES[name].sample(max(COUNTS), rng) for name in owner])
     held_out = {name: DENSITIES[name].sample(HELD_OUT, rng) for name in DENSITIES}
     wo = np.concatenate([held_out[name] for name in owner])
+    half_uniform = wo.copy()
+    half_uniform[::2] = uniform_directions(len(wo) // 2, rng)
     record = mi.UInt32(np.repeat(np.arange(len(owner), dtype=np.uint32), HELD_OUT))
+    at = vector(ASIDE * rng.normal(size=wo.shape)) if parallax else None
 
     def teach(batches: list[list[Particles]]) -> Any:
-        state = representation.init(len(owner), seed)
+        state = representation.init(len(owner), seed, parallax)
         for index, given in enumerate(batches):
-            state = representation.update(state, batch(given), seed + index)
+            state = representation.update(state, batch(given, parallax, far=True), seed + index)
             dr.eval(state)
         return state
 
-    def likelihood(state: Any) -> np.ndarray:
-        """[densities, REPLICATES]."""
-        pdf = as_numpy(representation.pdf(state, record, vector(wo)), len(wo))
-        return np.log((wo[:, 2] / np.pi + pdf) / 2).reshape(len(DENSITIES), REPLICATES, HELD_OUT).mean(-1)
+    def likelihood(state: Any, wo: np.ndarray, cosine: float) -> np.ndarray:
+        """Of q with so much of the cosine in it [densities, REPLICATES]."""
+        pdf = as_numpy(representation.pdf(state, record, vector(wo), True, at), len(wo))
+        q = cosine * wo[:, 2] / np.pi + (1 - cosine) * pdf
+        return np.log(q).reshape(len(DENSITIES), REPLICATES, HELD_OUT).mean(-1)
 
     def batches(directions: np.ndarray, n: int = 1) -> list[list[Particles]]:
         return [[equal(d) for d in part] for part in np.split(directions, n, axis=1)]
 
-    def among_decoys(weight: float, of_decoys: float) -> list[list[Particles]]:
-        weights = np.repeat(np.array([weight, of_decoys], np.float32), half)[order]
-        return [[(np.concatenate([p[:half], decoys])[order], weights) for p in particles]]
+    def among_decoys(power: float) -> list[list[Particles]]:
+        each = (np.repeat([1, LIGHT], [half, len(decoys)]) ** power).astype(np.float32)
+        return [[(np.concatenate([p[:half], decoys])[order], each[order]) for p, order in zip(particles, orders, strict=True)]]
 
     some, half = particles[:, :COUNTS[1]], COUNTS[1] // 2
-    decoys, order = uniform_directions(half, rng), rng.permutation(2 * half)
+    decoys = uniform_directions(round(half / LIGHT), rng)
+    orders = [rng.permutation(half + len(decoys)) for _ in particles]
     x = some[:, :, :1]
     in_turn = np.take_along_axis(some, np.argsort(x > np.median(x, axis=1, keepdims=True), axis=1, kind="stable"), axis=1)
     counts = {n: f"{n} particles" for n in (0, *COUNTS)}
     none, few, once, most = counts.values()
+    weights, powers = "the weights", {"their square roots": 0.5, "their squares": 2.0}
     online, both = f"{once} in {PARTS} batches", "its left half, then the right"
     both_online = f"{both}, in {PARTS} batches"
     lessons = {none: [], **{counts[n]: batches(particles[:, :n]) for n in COUNTS}, online: batches(some, PARTS),
-               "right weights": among_decoys(1, LIGHT), "those of decoys": among_decoys(LIGHT, 1),
+               weights: among_decoys(1), **{what: among_decoys(power) for what, power in powers.items()},
                "its left half": batches(in_turn[:, :half]), "its right half": batches(in_turn[:, half:]),
                both: batches(in_turn), both_online: batches(in_turn, PARTS)}
-    found = {what: likelihood(teach(given)) for what, given in lessons.items()}
+    found = {what: likelihood(teach(given), *((half_uniform, LITTLE) if what in (weights, *powers) else (wo, 0.5)))
+             for what, given in lessons.items()}
 
     def picture(name: str, what: str) -> Picture:
-        return lambda: _beside(representation, teach(lessons[what]), owner.index(name), name, what)
+        return lambda: _beside(representation, teach(lessons[what]), owner.index(name), name, what, parallax)
 
     loss = zip((found[once] - found[online]).mean(1), DENSITIES, strict=True)
     note = (f"mean ln q {', '.join(f'{found[what].mean():.3f} ({n})' for n, what in counts.items())} particles; {COUNTS[1]} "
             f"in {PARTS} batches instead of 1 lose {', '.join(f'{v:.3f} ({name})' for v, name in loss)}")
     if constant:
-        same = all(np.array_equal(v, found[none]) for v in found.values())
+        same = all(np.array_equal(v, found[weights if what in powers else none]) for what, v in found.items() if what != weights)
         return Verdict(same, "densities that learn", float(not same), 0.0, "" if same else "it was declared constant, but learns",
                        note=f"{note}{', as declared' if same else ''}")
 
+    asked: list[tuple[str, str, float, Callable[..., Any]]] = [
+        *((what, none, LEAST, np.min) for what in (once, most, online)),
+        *((weights, other, LEAST, np.mean) for other in powers),
+        *((what, over, MORE, np.max) for what in (both, both_online) for over in ("its left half", "its right half"))]
     missed = []
-    for what, over, least, which in (
-            *((what, none, LEAST, min) for what in (once, most, online)), ("right weights", "those of decoys", LEAST, min),
-            *((what, over, MORE, max) for what in (both, both_online) for over in ("its left half", "its right half"))):
-        gain, name = which((float(g), name) for g, name in zip((found[what] - found[over]).mean(1), DENSITIES, strict=True)
-                           if name in HARD)
+    for what, over, least, judge in asked:
+        gains = dict(zip(DENSITIES, (found[what] - found[over]).mean(1), strict=True))
+        gain = float(judge([gains[name] for name in HARD]))
         if not gain >= least:
+            name = min(HARD, key=lambda name: abs(gains[name] - gain))
             words = f"'{name}' is {gain:+.3f} nats more likely after {what} than after {over}"
             missed.append(Verdict(False, "least gain [nats]", gain, least, words, note=note, picture=picture(name, what)))
     if missed:
@@ -129,12 +149,13 @@ def learn(representation: Any, seed: int, constant: bool, level: float) -> Verdi
     return p_values.verdict(level, note)
 
 
-def _beside(representation: Any, state: Any, record: int, name: str, what: str) -> list[Panel]:
+def _beside(representation: Any, state: Any, record: int, name: str, what: str, parallax: bool) -> list[Panel]:
     """The known density beside what was learnt."""
     truth = DENSITIES[name].sample(1 << 20, np.random.default_rng(1))
 
     def pdf(wo: np.ndarray) -> np.ndarray:
-        return as_numpy(representation.pdf(state, dr.full(mi.UInt32, record, len(wo)), vector(wo)), len(wo))
+        at = vector(np.zeros_like(wo)) if parallax else None
+        return as_numpy(representation.pdf(state, dr.full(mi.UInt32, record, len(wo)), vector(wo), True, at), len(wo))
 
     return [Panel(f"'{name}': histogram of the truth", over_disk(truth, np.full(len(truth), 1 / len(truth)))),
             of_density(f"pdf after {what}", pdf)]

@@ -15,37 +15,49 @@ from olpm_bench.check.picture import of_density, over_disk
 from olpm_bench.check.proposal import Proposals
 from olpm_bench.check.samples import BINS, FEWEST, bin_of, chi_square, of_sums
 from olpm_bench.check.trained import as_numpy
-from olpm_bench.check.verdict import Panel, Picture, PValues, Verdict
+from olpm_bench.check.verdict import Panel, Picture, PValues, Verdict, sidak, worst_of
 from representations.interface import ParticleBatch
 from representations.state import bytes_of
 
 RECORDS, BYTES = 1 << 15, 1 << 28       # as many records, unless their states take more memory than this
-PARTICLES = 96              # of each: more than a mixture's first fit needs
+PARTICLES = 96              # of each in its first batch: more than a mixture's first fit needs
 SPREAD = 0.15               # radius of a record's lobe [rad]
+PLACES = 0.05               # deviation of the points where particles land, and from which records are asked [scene units]
 DIRECTIONS = 16             # samples of each record, and as many directions of a proposal
 PACKET = 16                 # lanes
 SHOWN = 1 << 17             # samples of a record in the picture of it
 
 
 def are_right(representation: Any, seed: int, level: float) -> Verdict:
-    """Each record learns a lobe of its own; all samples and densities are looked at, and compared as in `follow_pdf`:
-    over bins of the square, over blocks of records, and over the lanes of a packet.
+    """Each record learns a lobe of its own in two batches; all samples and densities are looked at, and compared as in
+    `follow_pdf`: over bins of the square, over blocks of records, and over the lanes of a packet.  Without parallax, and with it,
+    asked from beside the record and as it is.
     """
-    rng = np.random.default_rng([4, seed])
-    n = records_that_fit(representation, RECORDS)
-    axis = uniform_directions(n, rng)
-    state = representation.update(representation.init(n, seed), _lobes(axis, rng), seed)
-    dr.eval(state)
+    found, rng = {}, np.random.default_rng([4, seed])
+    axis = uniform_directions(records_that_fit(representation, RECORDS), rng)
+    for parallax in (False, True):
+        state = representation.init(len(axis), seed, parallax)
+        for index, particles in enumerate((PARTICLES, PARTICLES // 4)):
+            state = representation.update(state, _lobes(axis, particles, parallax, rng), seed + index)
+            dr.eval(state)
+        for aside, words in ((True, "with parallax"), (False, "with parallax, asked as it is")) if parallax else ((False, ""),):
+            found[words] = _compare(representation, state, axis, aside, sidak(level, 3), rng)
+    return worst_of(found)
 
+
+def _compare(representation: Any, state: Any, axis: np.ndarray, aside: bool, level: float, rng: np.random.Generator) -> Verdict:
+    """Samples and densities, asked from beside the records or as they are."""
+    n = len(axis)
     record = rng.permutation(np.repeat(np.arange(n), DIRECTIONS))
     index, lanes = mi.UInt32(record.astype(np.uint32)), len(record)
+    at = vector(PLACES * rng.standard_normal((lanes, 3), np.float32)) if aside else None
     proposals = Proposals(list(zip(axis[:, None], np.ones((n, 1)), strict=True)), rng)
     x, reported = representation.sample(state, index, mi.Float(rng.random(lanes, np.float32)),
-                                        mi.Point2f(rng.random((2, lanes), np.float32)))
+                                        mi.Point2f(rng.random((2, lanes), np.float32)), True, at)
     dr.eval(x, reported)
     x, y = np.stack([as_numpy(c, lanes) for c in x], -1), proposals.at(record, rng.random((lanes, 3)))
-    reported, f_x, f_y = (as_numpy(p, lanes) for p in (reported, representation.pdf(state, index, vector(x)),
-                                                       representation.pdf(state, index, vector(y))))
+    reported, f_x, f_y = (as_numpy(p, lanes) for p in (reported, representation.pdf(state, index, vector(x), True, at),
+                                                       representation.pdf(state, index, vector(y), True, at)))
     fine = np.isfinite(x).all(1)
     for wo, f in ((x, f_x), (y, f_y)):
         fine &= np.isfinite(f) & (f >= 0) & ((wo[:, 2] > 0) | (f == 0))
@@ -105,10 +117,11 @@ def _of_groups(what: str, sampled: np.ndarray, expected: np.ndarray, variance: n
         ("sampled - by the pdf", z, "signed", "standard deviations"))]
 
 
-def _lobes(axis: np.ndarray, rng: np.random.Generator) -> ParticleBatch:
-    """A lobe around the axis of each record."""
-    n = len(axis)
-    wo = np.repeat(axis, PARTICLES, axis=0) + SPREAD * rng.standard_normal((n * PARTICLES, 3), np.float32)
+def _lobes(axis: np.ndarray, particles: int, parallax: bool, rng: np.random.Generator) -> ParticleBatch:
+    """A lobe around the axis of each record, of light that is far away, so that it is there from all places."""
+    n, m = len(axis), len(axis) * particles
+    wo = np.repeat(axis, particles, axis=0) + SPREAD * rng.standard_normal((m, 3), np.float32)
     wo[:, 2] = np.abs(wo[:, 2]) + 1e-3
-    record = mi.UInt32(np.repeat(np.arange(n, dtype=np.uint32), PARTICLES))
-    return ParticleBatch.from_arrays(vector(normalised(wo)), dr.ones(mi.Float, n * PARTICLES), record, n)
+    record = mi.UInt32(np.repeat(np.arange(n, dtype=np.uint32), particles))
+    at = vector(PLACES * rng.standard_normal((m, 3), np.float32)) if parallax else None
+    return ParticleBatch.from_arrays(vector(normalised(wo)), dr.ones(mi.Float, m), record, n, None, at)

@@ -11,6 +11,7 @@ from representations.interface import ParticleBatch
 
 Particles = tuple[np.ndarray, np.ndarray]       # of one record in one batch: wo [n, 3], weight [n]
 BATCHES = 3
+LATE = 80               # batches of records that learn for long, more than the default training has
 MILLION = 1_000_000
 EDGE = 1e-4             # elevation z of grazing particles
 
@@ -83,7 +84,11 @@ CONDITIONS: dict[str, Condition] = {
     "many modes": lambda rng, copy: [many(400, rng)],
     "on-line": lambda rng, copy: [many(120, rng) for _ in range(BATCHES)],
     "none at first": lambda rng, copy: [nothing(), nothing(), many(200, rng)],
+    "more than a thousand": lambda rng, copy: [many(100, rng), many(1_500, rng)],
+}
+LONG: dict[str, Condition] = {          # that take time, of one record each
     "a million": lambda rng, copy: [many(100, rng), many(MILLION, rng)],
+    "late": lambda rng, copy: [many(5, rng) for _ in range(LATE)],      # as many as `Proposals` look around
 }
 
 
@@ -100,8 +105,8 @@ def landing(wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(place, (len(wo), 3)), np.broadcast_to(distance, len(wo))
 
 
-def batch(particles: list[Particles], parallax: bool = False) -> ParticleBatch:
-    """The particles of all records as Dr.Jit arrays; for `parallax` with places and distances."""
+def batch(particles: list[Particles], parallax: bool = False, far: bool = False) -> ParticleBatch:
+    """The particles of all records as Dr.Jit arrays; for `parallax` with places and distances, all infinite if `far`."""
     if not any(len(weight) for _, weight in particles):
         return ParticleBatch.empty(len(particles))
     wo, weight = (np.concatenate([p[i] for p in particles]).astype(np.float32) for i in (0, 1))
@@ -109,5 +114,6 @@ def batch(particles: list[Particles], parallax: bool = False) -> ParticleBatch:
     if not parallax:
         return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles))
     at, distance = (np.concatenate(values).astype(np.float32) for values in zip(*(landing(p[0]) for p in particles), strict=True))
+    distance = np.full_like(distance, np.inf) if far else distance
     return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles), mi.Float(distance),
                                      vector(at))

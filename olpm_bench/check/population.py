@@ -10,8 +10,8 @@ import numpy as np
 from scipy.stats import qmc
 
 from olpm_bench.check.particles import (
-    BATCHES,
     CONDITIONS,
+    LONG,
     Particles,
     batch,
     landing,
@@ -138,9 +138,9 @@ class Population:
 
 
 @functools.lru_cache(2)
-def population(seed: int, copies: int = COPIES, million: bool = True) -> Population:
-    """Records in every condition."""
-    records = _records(copies, million)
+def population(seed: int, copies: int = COPIES, long: bool = True) -> Population:
+    """Records in every condition; without the `LONG` ones, in few batches."""
+    records = _records(copies, long)
     return Population([name for name, _ in records], _batches(records, np.random.default_rng([1, seed])), seed)
 
 
@@ -152,11 +152,11 @@ def population_with_parallax(seed: int) -> Population:
     return Population([f"{name}, {asked[copy]}" for name, copy in records], _batches(records, rng), seed, at)
 
 
-def _records(copies: int, million: bool = True) -> list[tuple[str, int]]:
-    """Conditions and numbers of copies, in an order that puts neighbours into different conditions; only one has a million."""
-    return [(name, copy) for copy in range(copies) for name in CONDITIONS if name != "a million" or (million and copy == 0)]
+def _records(copies: int, long: bool = True) -> list[tuple[str, int]]:
+    """Conditions and numbers of copies, in an order that puts neighbours into different conditions."""
+    return [(name, copy) for copy in range(copies) for name in (CONDITIONS | LONG if long and copy == 0 else CONDITIONS)]
 
 
 def _batches(records: list[tuple[str, int]], rng: np.random.Generator) -> list[list[Particles]]:
-    batches = [CONDITIONS[name](rng, copy) for name, copy in records]
-    return [[b[i] if i < len(b) else nothing() for b in batches] for i in range(BATCHES)]
+    batches = [(CONDITIONS | LONG)[name](rng, copy) for name, copy in records]
+    return [[b[i] if i < len(b) else nothing() for b in batches] for i in range(max(map(len, batches)))]

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import drjit as dr
@@ -17,13 +17,15 @@ from olpm_bench.check.particles import Particles, batch, lobes, many, normalised
 from olpm_bench.check.picture import of_density
 from olpm_bench.check.population import population
 from olpm_bench.check.trained import as_numpy
-from olpm_bench.check.verdict import Failure, Picture, PValues, Verdict, combined, exact, sidak
+from olpm_bench.check.verdict import Failure, Picture, PValues, Verdict, exact, sidak, worst_of
 from representations.interface import ParticleBatch
 from representations.state import append, copied, from_numpy, to_numpy
 
 COPIES = 2                  # records in each condition
 QUERIES = 256               # directions at which densities are compared, for each record
-REORDERED = 256             # records whose order is changed
+REORDERED = 256             # records whose order is changed, ...
+CROWD = 1_500               # ... and particles of each: more than a state may keep, so that it draws some
+DEEPEST = 4                 # containers within containers of an instance that are looked into
 FEWER_QUERIES = 64          # for each of those
 BESIDE = (0.05, -0.03, 0.01)        # where states with parallax are asked [scene units]; particles land within 0.1
 FAINT = 1e-6                # densities [1/sr] and differences of densities that count as nothing
@@ -39,7 +41,7 @@ class Trials:
     def __init__(self, specification: dict[str, Any], seed: int, parallax: bool = False, grows: bool = False) -> None:
         self.representation, self.another = (representations.create(**specification) for _ in range(2))
         self.seed, self.parallax, self.grows = seed, parallax, grows
-        self.records = population(seed, COPIES, million=False)
+        self.records = population(seed, COPIES, long=False)
         self.batches, self.n = self.records.batches, len(self.records)
         rng, directions = self.records.rng(8), []
         for r in range(self.n):
@@ -103,12 +105,8 @@ def both(check: Callable[..., Verdict]) -> Callable[..., Verdict]:
     """The check of states without and with parallax, in one verdict, that of the worse ones."""
     @functools.wraps(check)
     def of_both(trials: Sequence[Trials], *level: float) -> Verdict:
-        verdicts = [check(one, *(sidak(a, len(trials)) for a in level)) for one in trials]
-        worst = min(verdicts, key=lambda v: (v.passed, 1.0 if v.p is None else v.p))
-        words = "with parallax, " if worst is not verdicts[0] else ""
-        notes = dict.fromkeys(v.note for v in verdicts if v.note)
-        return replace(worst, worst=worst.worst and words + worst.worst, tests=len(trials) * worst.tests,
-                       p=None if worst.p is None else combined(worst.p, len(trials)), note="; with parallax: ".join(notes))
+        return worst_of({"with parallax" if one.parallax else "": check(one, *(sidak(a, len(trials)) for a in level))
+                         for one in trials})
     return of_both
 
 
@@ -120,7 +118,7 @@ def stay_pure(trials: Trials) -> Verdict:
     which a note tells.
     """
     r, n, seed = trials.representation, trials.n, trials.seed
-    state, wrong, pictures, unused = trials.init(n, seed), [], [], False
+    state, wrong, pictures, unused, kept = trials.init(n, seed), [], [], True, None
     if _differing(state, trials.init(n, seed)):
         wrong.append("init() with the same seed gives another state")
     record = mi.UInt32(np.repeat(np.arange(n, dtype=np.uint32), QUERIES))
@@ -132,8 +130,7 @@ def stay_pure(trials: Trials) -> Verdict:
         before, given_before = _bits(state), _bits(given)
         new, again = (r.update(state, given, seed + number) for _ in range(2))
         dr.eval(new, again)
-        if number == 1:
-            unused = not _differing(new, r.update(state, given, seed + len(trials.batches) + 1))
+        unused &= not _differing(new, r.update(state, given, seed + len(trials.batches) + number))
         if _differing(new, again):
             wrong.append(f"update number {number} with the same arguments gives other bits in {_differing(new, again)}")
             pictures += [f.picture for f in trials.differences("once more", again, new, bits=True)]
@@ -150,9 +147,24 @@ def stay_pure(trials: Trials) -> Verdict:
                 wrong.append(f"{verb} with the same arguments gives other bits after update number {number}")
         if _bits(new) != before:
             wrong.append(f"sample() or pdf() changes the state after update number {number}")
-        state = new
+        if kept is not None and _attributes(r) != kept:         # after the first, which may keep tables for all that follow
+            wrong.append(f"update number {number} changes attributes of the instance, or of its class")
+        state, kept = new, _attributes(r)
     note = f"{len(trials.batches)} updates of {n} records, each twice" + ", the same with any seed" * unused
     return exact([Failure(len(wrong), "; ".join(wrong), next(iter(pictures), None))] if wrong else [], "violations", note)
+
+
+def _attributes(instance: Any) -> Any:
+    """All that an instance and its class hold, in a form that compares; of objects of other classes, which they are."""
+    def form(value: Any, depth: int = 0) -> Any:
+        if isinstance(value, np.ndarray) or (dr.is_array_v(value) and not isinstance(value, type)):
+            return np.array(value).tobytes()
+        if isinstance(value, dict) and depth < DEEPEST:
+            return {key: form(v, depth + 1) for key, v in value.items()}
+        if isinstance(value, list | tuple | set | frozenset) and depth < DEEPEST:
+            return [form(v, depth + 1) for v in value]
+        return value if isinstance(value, bool | int | float | str | None) else id(value)
+    return form(vars(instance)), [form(dict(vars(cls))) for cls in type(instance).__mro__[:-1]]
 
 
 def _bits(arrays: Any) -> dict[str, bytes]:
@@ -240,7 +252,7 @@ def _ignore_order(trials: Trials, rng: np.random.Generator, level: float) -> Ver
     """Permuted records give permuted densities, bit for bit; or, if random numbers go by the index of a record, they differ no
     more than by another seed: Wilcoxon's test of the distances, two for each record.
     """
-    particles, order, same = [many(200, rng) for _ in range(REORDERED)], rng.permutation(REORDERED), np.arange(REORDERED)
+    particles, order, same = [many(CROWD, rng) for _ in range(REORDERED)], rng.permutation(REORDERED), np.arange(REORDERED)
     wo = np.stack([p[0][:FEWER_QUERIES] for p in particles])
     base, reordered, reseeded = (trials.train([[particles[i] for i in o]], s) for o, s in (
         (same, trials.seed), (order, trials.seed), (same, trials.seed + 1000)))

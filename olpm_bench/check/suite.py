@@ -132,9 +132,9 @@ def run(subject: Subject, checks: Sequence[Check] = CHECKS, level: float = LEVEL
         start = time.perf_counter()
         try:
             verdict = check.run(subject, sidak(level, STATISTICAL))
-        except Exception as error:              # of other people's code
+        except (Exception, SystemExit) as error:        # of other people's code
             from olpm_bench.bench.progress import is_interrupt, reason
-            if is_interrupt(error):
+            if is_interrupt(error) and not isinstance(error, SystemExit):
                 raise
             where = traceback.extract_tb(error.__traceback__)[-1]
             words = f"{type(error).__name__}: {reason(error)} ({where.filename}:{where.lineno})"

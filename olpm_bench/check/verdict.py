@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -75,6 +75,17 @@ def exact(failures: list[Failure], measure: str, note: str = "") -> Verdict:
         return Verdict(True, measure, 0.0, 0.0, note=note)
     worst = max(failures, key=lambda f: f.size)
     return Verdict(False, measure, float(worst.size), 0.0, worst.words, note=note, picture=worst.picture)
+
+
+def worst_of(verdicts: dict[str, Verdict]) -> Verdict:
+    """That of the same check under several circumstances, as one; '' needs no words."""
+    where, worst = min(verdicts.items(), key=lambda v: (v[1].passed, 1.0 if v[1].p is None else v[1].p))
+    words = f"{where}, " * bool(where)
+    notes = [f"{name}: {v.note}" if name else v.note for name, v in verdicts.items()
+             if v.note and (not name or v.note not in [other.note for other in verdicts.values() if other is not v])]
+    n = len(verdicts)
+    return replace(worst, worst=worst.worst and words + worst.worst, tests=n * worst.tests,
+                   p=None if worst.p is None else combined(worst.p, n), note="; ".join(notes))
 
 
 class PValues:

@@ -15,9 +15,7 @@ The plan, before everything is turned by `rotation` so that no grid of a cache i
 
 By default the slats stop all direct sunlight: it reaches the room from their lit upper sides by way of the undersides above.
 
-Plain path tracing (Mitsuba's `path`, max_depth 13, 96 x 54 pixels) leaves 96.0 % of the pixels black at 1 spp (mean of 4 images)
-and needs 27,000 spp for a relative standard deviation of 5 % in the median pixel (quartiles 15,000 to 45,000): the variance of
-luminance over 24 images of 256 spp, over the square of its mean.
+How hard that is for plain path tracing: `tests/scenes/test_references.py`.
 """
 from __future__ import annotations
 

@@ -15,9 +15,7 @@ The plan, before everything is turned by `rotation` so that no grid of a cache i
 Behind the pleats is a flat blackout lining: what passes is a plane with one slit, and shading normals leak nothing.
 The sun draws a stripe across the sunny room's floor, most of it behind the partition.
 
-Plain path tracing (Mitsuba's `path`, max_depth 13, 96 x 54 pixels) leaves 97.9 % of the pixels black at 1 spp (mean of 4 images)
-and needs 93,000 spp for a relative standard deviation of 5 % in the median pixel (quartiles 44,000 to 170,000): the variance of
-luminance over 16 images of 256 spp, over the square of its mean.
+How hard that is for plain path tracing: `tests/scenes/test_references.py`.
 """
 from __future__ import annotations
 

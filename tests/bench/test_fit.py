@@ -97,6 +97,19 @@ def test_zero_densities_are_counted_and_the_integral_divided_out(files: tuple[Pa
     assert weighted["second_moment"] == pytest.approx((weight * pdf / q).sum() / weight.sum(), rel=1e-3)
 
 
+def test_the_scale_of_weights_does_not_matter(files: tuple[Path, Path], tmp_path: Path) -> None:
+    """Not even where their sum is too large for any number."""
+    jensen, expected, larger = representations.create("jensen"), {}, []
+    expected = fit(jensen, *files)
+    for file in files:
+        with np.load(file) as archive:
+            arrays = dict(archive)
+        larger.append(save(tmp_path / f"larger_{file.name}", arrays.pop("wo"),
+                           **arrays | {"weight": arrays["weight"].astype(np.float64) * 1e308}))
+    found = fit(jensen, *larger)
+    assert {**found, "seconds_per_particle": 0} == pytest.approx({**expected, "seconds_per_particle": 0})
+
+
 WO = cosine_directions(10, 2)
 
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy import stats
+from small_experiment import edit
 from typer.testing import CliRunner
 
 from olpm_bench.bench import experiment_file, gate, metrics, run, statistics
@@ -58,7 +59,7 @@ def known(tmp_path, monkeypatch):
     for spec in experiment.cells():
         better = spec.method.name == "Better"
         image = truth + (0.1 if better else rng.uniform(0.14, 0.16)) * rng.normal(size=(12, 16, 1)).astype(np.float32)
-        info = {"key": spec.key, "charged_seconds": 2.0 if better else 1.0}
+        info = {"key": spec.key, "charged_seconds": 2.0 if better else 1.0, "mean": float(image.mean()), "mean_stderr": 0.01}
         results.write_cell("cornell_box", spec.method.name, spec.seed, info, [{"seconds": 1.0}],
                            {"mean": image, "variance": truth, "count": truth[..., 0]}, [image])
     monkeypatch.setattr(run, "run", lambda *_: [])
@@ -121,6 +122,15 @@ def test_what_cannot_be_measured_does_not_hold(known, monkeypatch):
     for value in (float("nan"), 0.0):
         monkeypatch.setitem(metrics.METRICS, "l1", lambda x, r, value=value: value)
         assert not judge(known(f'{CLAIM}metric = "l1"\nratio = 1e9'))[0].holds
+
+
+def test_who_is_biased_is_not_better(known):
+    experiment = known(CLAIM)
+    for cell in (experiment.path.parent / "results").glob("claims/cells/*/Better/*/cell.json"):
+        edit(cell, mean=0.6, mean_stderr=0.001)
+    verdict, = judge(experiment)
+    assert verdict.high < 1 and not verdict.holds
+    assert str(verdict) == f"FAILS: the means are {verdict.apart:.0f} standard errors apart" and verdict.apart > gate.APART
 
 
 def test_claims_come_back_from_the_results_folder(known):

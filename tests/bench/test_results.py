@@ -3,13 +3,14 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 from olpm_bench.bench import results as r
 from olpm_bench.bench.exr import read_exr
-from olpm_bench.bench.files import NewerSchemaError, ResultError, read_json, write_json
+from olpm_bench.bench.files import NewerSchemaError, ResultError, digest, read_json, write_json
 from olpm_bench.bench.results import Cell, Results
 
 rng = np.random.default_rng(7)
@@ -69,17 +70,36 @@ def test_a_whole_file_of_another_cell_is_not_believed(tmp_path, name):
             results.read_cell("a scene", "GMM, K = 8", seed)
 
 
-def test_cells_of_older_versions_have_no_digests_of_images_and_those_must_be_of_the_right_size(tmp_path):
+def test_images_must_be_of_the_right_size(tmp_path):
     results, names = Results(tmp_path), ("a scene", "GMM, K = 8", 0)
+    write_cell(results)
+    assert results.verified_cell(*names, (5, 7)) is not None
+    for read in (lambda cell: cell.image(), lambda cell: cell.checkpoints()):
+        with pytest.raises(ResultError, match=r"\.exr is broken: 7x5 pixels in place of 7x6"):
+            read(results.read_cell(*names, (6, 7)))
+
+
+@pytest.mark.parametrize("name", ["cell.json", "image.exr", "checkpoints.exr", "trace.jsonl"])
+def test_no_digest_may_be_missing(tmp_path, name):
+    results = Results(tmp_path)
     folder = write_cell(results).folder
     info = json.loads((folder / "cell.json").read_text())
-    older = {name: info["digests"][name] for name in ("cell.json", "trace.jsonl")}
-    for digests in (older, {}):
-        write_json(folder / "cell.json", info | {"digests": digests})
-        assert results.verified_cell(*names, (5, 7)) is not None
-        for read in (lambda cell: cell.image(), lambda cell: cell.checkpoints()):
-            with pytest.raises(ResultError, match=r"\.exr is broken: 7x5 pixels in place of 7x6"):
-                read(results.read_cell(*names, (6, 7)))
+    del info["digests"][name]
+    write_json(folder / "cell.json", info)
+    with pytest.raises(ResultError, match=rf"{name} is broken: its digest is another"):
+        results.read_cell("a scene", "GMM, K = 8", 0)
+
+
+def test_a_cell_in_the_folder_of_another_is_not_believed(tmp_path):
+    results = Results(tmp_path)
+    one, other = (write_cell(results, seed=seed).folder for seed in (0, 1))
+    shutil.copytree(one, other, dirs_exist_ok=True)
+    with pytest.raises(ResultError, match=r"1/cell\.json is of another cell"):
+        results.read_cell("a scene", "GMM, K = 8", 1)
+    info = json.loads((one / "cell.json").read_text())
+    write_json(other / "cell.json", info | {"seed": 1})
+    with pytest.raises(ResultError, match=r"1/cell\.json is broken: its digest is another"):
+        results.read_cell("a scene", "GMM, K = 8", 1)
 
 
 def test_a_checkpoint_too_few_is_noticed(tmp_path):
@@ -89,7 +109,8 @@ def test_a_checkpoint_too_few_is_noticed(tmp_path):
     with pytest.raises(ResultError, match=r"trace\.jsonl is broken"):
         Results(tmp_path).verified_cell("a scene", "GMM, K = 8", 0)
     info = json.loads((cell.folder / "cell.json").read_text())
-    write_json(cell.folder / "cell.json", info | {"digests": {}})          # of an older version
+    info["digests"]["trace.jsonl"] = digest(trace.read_bytes())
+    write_json(cell.folder / "cell.json", info)
     with pytest.raises(ResultError, match="3 images for 2 checkpoints"):
         Results(tmp_path).verified_cell("a scene", "GMM, K = 8", 0)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_experiment import TOML
+from small_experiment import TOML, edit
 
 from olpm_bench.bench import experiment_file, reference, run
 from olpm_bench.bench.cell import CellFailedError
@@ -93,7 +93,7 @@ def test_changed_broken_and_missing_cells_are_redone(experiment, root, monkeypat
     done = cells(experiment, root)
     (done[0].folder / "image.exr").write_bytes(b"broken")
     (done[1].folder / "cell.json").unlink()
-    (done[2].folder / "cell.json").write_text(json.dumps({**done[2].info, "key": "of other settings"}))
+    edit(done[2].folder / "cell.json", key="of other settings")
     monkeypatch.setattr(run, "measure", counted := Counted())
     assert run.run(experiment, root) == [] and counted.calls == 3
     assert [c.info["key"] for c in cells(experiment, root)] == [c.key for c in experiment.cells()]

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rich.console import Console
+from small_experiment import edit
 
 from olpm_bench.bench import config, experiment_file, finished, statistics, summary
 from olpm_bench.bench.files import ResultError
@@ -20,7 +21,7 @@ from olpm_bench.transport.settings import IntegratorSettings
 KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "mape", "smape", "relmse", "relmse_trimmed", "flip", "ssim_error",
         "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "charged_seconds", "overrun",
         "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
-        "bytes_per_record", "particles", "worst_speed_up", "noise_floor", "warnings"]
+        "bytes_per_record", "particles", "worst_speed_up", "apart", "noise_floor", "warnings"]
 ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
 TIMES = [1.0, 4.0, 16.0]
 
@@ -180,10 +181,23 @@ def test_gains_and_speed_ups_are_over_the_baseline(known):
     assert list(found) == ["Slow"] and found["Slow"]["door_ajar"].value == pytest.approx(0.25, rel=1e-4)
 
 
+def test_methods_whose_means_differ_are_told(known):
+    def told() -> list[str]:
+        return [note for note in summary.notes(summarised(known)["rows"]) if "standard errors" in note]
+    assert told() == []
+    for cell in (known.results.folder / "cells").glob("*/Fast/*/cell.json"):
+        edit(cell, mean=4.0, mean_stderr=0.01)
+    slow, fast = summarised(known)["rows"]
+    assert slow["apart"] == 0 and fast["apart"] == pytest.approx((4 - slow["mean"]) / (0.3 / 3 ** 0.5), rel=0.2)
+    assert told() == [f"door_ajar / Fast: its mean image is {fast['apart']:.0f} standard errors from the baseline's: one of the "
+                      "two is biased, or has too few samples to know its error"]
+
+
 def test_what_a_cell_does_not_know_is_null(known):
     path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "mean_stderr": None, "digests": {}}))
-    assert summarised(known)["rows"][0]["mean_stderr"] is None
+    edit(path, mean_stderr=None)
+    for row in summarised(known)["rows"]:
+        assert row["apart"] == 0 and (row["mean_stderr"] is None) == (row["method"] == "Slow")
 
 
 def test_a_missing_cell_is_named_with_the_command_that_makes_it(known):
@@ -194,7 +208,7 @@ def test_a_missing_cell_is_named_with_the_command_that_makes_it(known):
 
 def test_a_cell_of_another_configuration_does_not_count(known):
     path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
-    path.write_text(path.read_text().replace(json.loads(path.read_text())["key"], "0123456789abcdef"))
+    edit(path, key="0123456789abcdef")
     with pytest.raises(ResultError, match=r"door_ajar / Slow / seed 7 .* is of another configuration"):
         summarised(known)
 
@@ -202,10 +216,10 @@ def test_a_cell_of_another_configuration_does_not_count(known):
 def test_metrics_take_cells_of_other_versions_but_not_of_other_settings(known):
     """A key that is out of date tells of other code; the settings are in the header of the image."""
     path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
-    cell = json.loads(path.read_text())
-    path.write_text(json.dumps({**cell, "key": "0123456789abcdef"}))
+    key = json.loads(path.read_text())["key"]
+    edit(path, key="0123456789abcdef")
     again = summary.summarise(finished.read(known.experiment, known.results, known.references, any_version=True))
-    path.write_text(json.dumps(cell))
+    edit(path, key=key)
     assert again == summarised(known)
     for changes in ({"budget": config.Budget(seconds=17)}, {"integrator": IntegratorSettings(window=0.3)}):
         with pytest.raises(ResultError, match=r"door_ajar / Slow / seed 4 .* is of another configuration"):

@@ -10,7 +10,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from olpm_bench.check import examination, suite
-from olpm_bench.check.particles import CONDITIONS, many, nothing, uniform_directions
+from olpm_bench.check.particles import CONDITIONS, LATE, LONG, many, nothing, uniform_directions
 from olpm_bench.check.picture import CELL, over_disk
 from olpm_bench.check.population import ASKED, population, population_with_parallax
 from olpm_bench.check.proposal import Proposals
@@ -69,14 +69,14 @@ def test_proposals_have_their_density() -> None:
 
 def test_every_condition_is_in_both_populations() -> None:
     records = population(0)
-    assert set(records.conditions) == set(CONDITIONS)
+    assert set(records.conditions) == {*CONDITIONS, *LONG} and len(records.batches) == LATE
     assert max(len(records.of(r)[1]) for r in range(len(records))) > 1_000_000
     empty = [r for r in range(len(records)) if len(records.of(r)[1]) == 0]
     assert empty and all(records.conditions[r] in ("untrained", "few at a time") for r in empty)
     assert all(records.conditions[r] != records.conditions[r + 1] for r in range(len(records) - 1))
     aimed = population_with_parallax(0)
     everywhere = {f"{name}, {asked}" for name in CONDITIONS for asked in ASKED}
-    assert set(aimed.conditions) == everywhere - {"a million, afar"}
+    assert set(aimed.conditions) == everywhere | {f"{name}, {next(iter(ASKED))}" for name in LONG}
     identical = aimed.conditions.index("ten identical, beside")
     assert len(aimed.of(identical)[1]) == 10 and aimed.proposals.count[identical] == 1 and aimed.complete[identical]
 
@@ -97,6 +97,13 @@ def test_json(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout, parse_constant=lambda text: pytest.fail(f"{text} in JSON"))
     assert found["passed"] and [c["name"] for c in found["checks"]] == ["memory", "scale"] and not list(tmp_path.iterdir())
+
+
+def test_json_stays_json_if_the_representation_prints(tmp_path: Path) -> None:
+    (tmp_path / "prints.py").write_text("from representations.jensen import JensenHistogram\nclass Prints(JensenHistogram):\n"
+                                        "    def pdf(self, *args):\n        print('asked')\n        return super().pdf(*args)\n")
+    result = call(f"{tmp_path / 'prints.py'}:Prints", "--only", "scale", "--json")
+    assert json.loads(result.stdout)["passed"] and "asked" in result.stderr
 
 
 def test_a_failure_has_words_a_picture_and_an_exit_code(tmp_path: Path) -> None:

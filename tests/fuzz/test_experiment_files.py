@@ -5,6 +5,7 @@ import copy
 import io
 import shutil
 import stat
+from collections import Counter
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ VALID = {
 }
 TEXT = tomli_w.dumps(VALID).encode()
 COMMAND = get_command(app)          # made once, which takes longer than to read a file
+SEEN_SO_FAR: Counter[int] = Counter()           # exit codes
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(current)
         yield folder
+        print(f"{SEEN_SO_FAR.total()} experiment files: {SEEN_SO_FAR[0]} read, {SEEN_SO_FAR[2]} refused")   # with -rP
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +87,7 @@ def check(folder: Path, content: bytes, *options: str, name: str = "test.toml") 
         code = COMMAND.main(arguments, standalone_mode=False) or 0
     lines = [line for line in said.getvalue().split("\n") if line and "runs the code of" not in line]
     assert code in (0, 2), lines
+    SEEN_SO_FAR[code] += 1
     if code:
         assert len(lines) == 1 and lines[0].startswith("olpm-bench: "), lines
         assert len(lines[0]) < 2000 and lines[0].isprintable(), lines[0]

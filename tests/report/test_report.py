@@ -1,11 +1,11 @@
 """All of a report together: nothing is computed twice, the machines are named, and nothing of an earlier run stays."""
 from __future__ import annotations
 
-import json
 from collections import Counter
 from pathlib import Path
 
 import pytest
+from small_experiment import edit
 
 from olpm_bench.bench import run, statistics
 from olpm_bench.bench.results import Cell, Results
@@ -56,7 +56,7 @@ def test_captions_name_the_machines_that_made_the_cells(reported, monkeypatch, c
                 {"cpu": "Abacus 1", "threads": 4, "variant": "cuda_ad_rgb"})
     for seed, machine in enumerate(machines):
         for path in (folder / "cells").glob(f"*/*/{seed}/cell.json"):
-            path.write_text(json.dumps({**json.loads(path.read_text()), "machine": machine, "digests": {}}))
+            edit(path, machine=machine)
     reported()
     said = "Abacus 1, 4 threads, cuda_ad_rgb; Abacus 3, 2 threads"
     assert len(notes) == 4 and all(note.endswith(f" {said}.") for note in notes)

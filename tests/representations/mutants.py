@@ -74,6 +74,48 @@ class OneNaN(JensenHistogram):
         return dr.select(record % 10_000 == 9_999, dr.nan, super()._density(state, record, *args))
 
 
+@dataclass
+class Counted(JensenState):
+    updates: Any        # [n_records] that brought particles
+
+
+class LateInflation(JensenHistogram):
+    """Half too much from the eleventh update on, in sample() and pdf() alike."""
+    FIRST = 11
+
+    def init(self, n_records, seed=0, parallax=False):
+        return Counted(**vars(super().init(n_records, seed, parallax)), updates=dr.zeros(mi.Float, n_records))
+
+    def update(self, state, batch, seed=0):
+        taught = mi.Float(dr.minimum(batch.count(), 1))
+        return Counted(**vars(super().update(JensenState(state.mass, state.cumulative), batch, seed)),
+                       updates=state.updates + taught)
+
+    def _density(self, state, record, *args):
+        return super()._density(state, record, *args) * self.factor(dr.gather(mi.Float, state.updates, record), record)
+
+    def factor(self, updates, record):
+        return dr.select(updates >= self.FIRST, mi.Float(1.5), 1)
+
+
+class Drift(LateInflation):
+    """A thousandth too much after one update, two after two, and so on."""
+    def factor(self, updates, record):
+        return 1 + 1e-3 * updates
+
+
+class LateNaN(LateInflation):
+    """NaN from the twelfth update on."""
+    def factor(self, updates, record):
+        return dr.select(updates >= 12, dr.nan, mi.Float(1))
+
+
+class SecondNaN(LateInflation):
+    """NaN in one record in 10,000, from its second update on."""
+    def factor(self, updates, record):
+        return dr.select((record % 10_000 == 9_999) & (updates > 1), dr.nan, mi.Float(1))
+
+
 class NegativeAtTheRim(JensenHistogram):
     """Below 0 by rounding, close to the horizon."""
     def _density(self, state, record, wo, total, active):
@@ -202,6 +244,19 @@ class ParallaxTenPercent(HeyCones):
         return super()._density(state, record, wo, total, active, at) * (1 if at is None else 1.1)
 
 
+class ParallaxNaN(HeyCones):
+    """NaN in one record in 1,000, where it is asked from beside."""
+    def _density(self, state, record, wo, total, active, at):
+        pdf = super()._density(state, record, wo, total, active, at)
+        return pdf if at is None else dr.select(record % 1000 == 999, dr.nan, pdf)
+
+
+class NoPlaceAsked(HeyCones):
+    """Half too much where a state with parallax is asked without a place."""
+    def _density(self, state, record, wo, total, active, at):
+        return (1.5 if at is None and len(state.near) else 1.0) * super()._density(state, record, wo, total, active, at)
+
+
 class ParallaxNotReported(HeyCones):
     """sample() reports the density as it is at the record."""
     def sample(self, state, record, sample1, sample2, active=True, at=None):
@@ -243,6 +298,29 @@ class Unseeded(HeyCones):
 
     def update(self, state, batch, seed=0):
         return super().update(state, batch, int(self.generator.integers(2**32)))
+
+
+class UnseededWhenFull(JensenHistogram):
+    """Of more than 1,000 particles in a batch, learns from a half that no seed determines."""
+    random = np.random.default_rng()
+
+    def update(self, state, batch, seed=0):
+        if len(batch) == 0:
+            return state
+        full = dr.gather(mi.UInt32, batch.count(), batch.record) > 1000
+        dropped = full & (mi.Float(self.random.random(len(batch), np.float32)) < 0.5)
+        return super().update(state, replace(batch, weight=dr.select(dropped, 0, batch.weight)), seed)
+
+
+class KeepsBatches(JensenHistogram):
+    """Keeps all particles, but not in its state."""
+    def __init__(self, resolution: int = 16) -> None:
+        super().__init__(resolution)
+        self.kept: list[ParticleBatch] = []
+
+    def update(self, state, batch, seed=0):
+        self.kept.append(batch)
+        return super().update(state, batch, seed)
 
 
 class ParallaxInPlace(HeyCones):
@@ -388,6 +466,20 @@ class WeightsIgnored(JensenHistogram):
         return super().update(state, replace(batch, weight=dr.select(batch.weight > 0, mi.Float(1), 0)), seed)
 
 
+class RootsOfWeights(JensenHistogram):
+    """Learns from square roots."""
+    def update(self, state, batch, seed=0):
+        return super().update(state, replace(batch, weight=dr.sqrt(batch.weight)), seed)
+
+
+class ParallaxMirrored(GaussianMixture):
+    """Learns the other side, where particles say where they landed."""
+    def update(self, state, batch, seed=0):
+        if batch.at is not None:
+            batch = replace(batch, wo=mi.Vector3f(-batch.wo.x, -batch.wo.y, batch.wo.z))
+        return super().update(state, batch, seed)
+
+
 @dataclass
 class Hoard(JensenState):
     kept: Any               # weights of all particles, of all batches
@@ -409,6 +501,12 @@ class FailsToRun(CosineLobe):
         return cosine_pdf(wo) / state.mass
 
 
+class EndsTheProcess(JensenHistogram):
+    """Says that all is well."""
+    def update(self, state, batch, seed=0):
+        raise SystemExit(0)
+
+
 CAUGHT_BY = {
     WrongJacobian: "samples", PdfTimesTwoPercent: "samples",
     UntrainedTwoPercent: "samples", PdfTimesTen: "integral", WeightsUnnormalised: "samples",
@@ -425,4 +523,7 @@ CAUGHT_BY = {
     NeighboursListen: "independence", NothingIsNews: "nothing-new", FirstRecordsOnly: "new-records", LearnsNothing: "learning",
     Unlearns: "learning", FirstBatchOnly: "learning", LastBatchOnly: "learning", FirstHundredOnly: "learning",
     WeightsIgnored: "learning", MemoryGrows: "memory", FailsToRun: "density",
+    LateInflation: "integral", Drift: "integral", LateNaN: "density", SecondNaN: "many-records", ParallaxNaN: "many-records",
+    NoPlaceAsked: "many-records", UnseededWhenFull: "purity", KeepsBatches: "purity",
+    RootsOfWeights: "learning", ParallaxMirrored: "learning", EndsTheProcess: "density",
 }

@@ -26,4 +26,4 @@ def test_every_check_rejects_something() -> None:
 def test_a_mutant_is_rejected(mutant: type, check: str) -> None:
     verdict = outcome(mutant, check).verdict
     assert not verdict.passed
-    assert (verdict.measure == "error") == (mutant is mutants.FailsToRun), verdict.worst
+    assert (verdict.measure == "error") == (mutant in (mutants.FailsToRun, mutants.EndsTheProcess)), verdict.worst

@@ -73,7 +73,8 @@ def test_from_file_that_lacks_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("code", "message"), [
     ("class Tilted(", "SyntaxError: "), ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
-    ("raise RuntimeError('two\\nlines')", "RuntimeError: two lines")])
+    ("raise RuntimeError('two\\nlines')", "RuntimeError: two lines"),
+    ("class Tilted: pass\nraise SystemExit(0)", "SystemExit: 0")])
 def test_from_file_that_cannot_be_run(tmp_path: Path, code: str, message: str) -> None:
     file = tmp_path / "broken_file.py"
     file.write_text(code)
@@ -85,6 +86,7 @@ def test_from_file_that_cannot_be_run(tmp_path: Path, code: str, message: str) -
 @pytest.mark.parametrize(("code", "message"), [
     ("class Tilted:\n    def __init__(self, tilt=0.5): {}['tilt']", "cannot be loaded: KeyError: 'tilt'"),
     ("class Tilted:\n    def __init__(self, tilt=0.5): assert tilt < 0.1, 'steep'", "cannot be loaded: AssertionError: steep"),
+    ("class Tilted:\n    def __init__(self, tilt=0.5): raise SystemExit(0)", "cannot be loaded: SystemExit: 0"),
     ("class Tilted(dict):\n    pass", "no signature found"),
     ("class Tilted:\n    def __init__(self, tilt=0.5): raise ValueError('steep')", ": steep")])
 def test_from_file_whose_class_cannot_be_made(tmp_path: Path, code: str, message: str) -> None:
