@@ -158,5 +158,9 @@ def _records(copies: int, long: bool = True) -> list[tuple[str, int]]:
 
 
 def _batches(records: list[tuple[str, int]], rng: np.random.Generator) -> list[list[Particles]]:
+    """One list a batch.  Of conditions with fewer, some copies learn in the first batches, and others in the last."""
     batches = [(CONDITIONS | LONG)[name](rng, copy) for name, copy in records]
-    return [[b[i] if i < len(b) else nothing() for b in batches] for i in range(max(map(len, batches)))]
+    n = max(map(len, batches))
+    waits = [[nothing()] * (n - len(b)) for b in batches]
+    padded = [wait + b if copy % 2 else b + wait for b, wait, (_, copy) in zip(batches, waits, records, strict=True)]
+    return [list(particles) for particles in zip(*padded, strict=True)]

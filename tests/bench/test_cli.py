@@ -379,7 +379,8 @@ def test_code_that_ends_the_process_is_no_success(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("ends.py").write_text("from representations.cosine import CosineLobe\n\nclass Ends(CosineLobe):\n"
                                "    def update(self, *args):\n        raise SystemExit(0)\n")
-    Path("good.toml").write_text(TOML + 'representation = { type = "ends.py:Ends" }\n'
+    Path("good.toml").write_text(TOML.replace("max_depth = 3", 'max_depth = 3\nreference = "none"')
+                                 + 'representation = { type = "ends.py:Ends" }\n'
                                  "training = { passes = 1, photons = 1000, importons = 1000, camera_passes = 0 }\n")
     result = call("run", "good.toml")
     assert result.exit_code == 1 and "code that is not ours has ended the process" in result.stderr
