@@ -34,7 +34,7 @@ class Verdict:
     ratio: float
     low: float
     high: float
-    apart: float = 0.0
+    apart: float
 
     @property
     def holds(self) -> bool:
