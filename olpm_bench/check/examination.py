@@ -1,10 +1,11 @@
 """`olpm-bench check`: one run of all checks with its table and pictures, or many runs to count the false alarms."""
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,18 @@ import mitsuba as mi
 from rich.console import Console
 from scipy import stats
 
+import representations
 from olpm_bench.bench.config import own_code
 from olpm_bench.bench.files import ResultError, digest, plain, slug
 from olpm_bench.bench.progress import Bar, is_interrupt
-from olpm_bench.check import suite
+from olpm_bench.check import isolated, suite
 from olpm_bench.check.suite import LEVEL, Check, Outcome, Subject
 from olpm_bench.report import verdicts
 
 COARSE = (0.1, 0.01)        # levels at which a campaign of some runs can see whether p-values are honest
 CHANCE = 1e-3               # that honest ones are taken for dishonest, in a campaign
+
+Run = Callable[[Subject, Sequence[Check]], Iterator[Outcome]]
 
 
 def examine(subject: Subject, checks: Sequence[Check], folder: Path, quiet: bool = False) -> dict[str, Any]:
@@ -30,7 +34,8 @@ def examine(subject: Subject, checks: Sequence[Check], folder: Path, quiet: bool
         What `--json` prints.
     """
     start = time.perf_counter()
-    outcomes = _run(subject, checks)
+    with _examiner(subject) as run:
+        outcomes = _run(run, subject, checks)
     pictures = {o.check.name: str(path) for o in outcomes if (path := _draw(o, subject, folder)) is not None}
     seconds, passed = time.perf_counter() - start, all(o.verdict.passed for o in outcomes)
     if not quiet:
@@ -56,24 +61,25 @@ def campaign(subject: Subject, checks: Sequence[Check], runs: int, folder: Path,
     """
     console, about = Console(), _about(subject, checks)
     found = _logged(log, about)
-    for seed in range(subject.seed, subject.seed + runs):
-        if seed in found:
-            continue
-        one = Subject(subject.specification, seed, subject.declared)
-        start = time.perf_counter()
-        outcomes = _run(one, checks)
-        failed = [o for o in outcomes if not o.verdict.passed]
-        p = suite.p_value(outcomes)
-        found[seed] = plain({
-            **about, "seed": seed, "passed": not failed, "p": p, "failed": {o.check.name: o.verdict.worst for o in failed},
-            "smallest": {o.check.name: o.verdict.p for o in outcomes if o.verdict.p is not None},
-            "seconds": time.perf_counter() - start, "pictures": [
-                str(path) for o in failed if (path := _draw(o, one, folder / f"seed{seed}")) is not None]})
-        if log is not None:
-            _append(log, json.dumps(found[seed], allow_nan=False))
-        if not quiet:
-            words = "; ".join(f"{o.check.name}: {o.verdict.worst}" for o in failed)
-            verdicts.line(console, f"seed {seed}: {f'FAILED {words}' if failed else f'passed, p = {p:.3g}'}")
+    with _examiner(subject) as run:
+        for seed in range(subject.seed, subject.seed + runs):
+            if seed in found:
+                continue
+            one = Subject(subject.specification, seed, subject.declared)
+            start = time.perf_counter()
+            outcomes = _run(run, one, checks)
+            failed = [o for o in outcomes if not o.verdict.passed]
+            p = suite.p_value(outcomes)
+            found[seed] = plain({
+                **about, "seed": seed, "passed": not failed, "p": p, "failed": {o.check.name: o.verdict.worst for o in failed},
+                "smallest": {o.check.name: o.verdict.p for o in outcomes if o.verdict.p is not None},
+                "seconds": time.perf_counter() - start, "pictures": [
+                    str(path) for o in failed if (path := _draw(o, one, folder / f"seed{seed}")) is not None]})
+            if log is not None:
+                _append(log, json.dumps(found[seed], allow_nan=False))
+            if not quiet:
+                words = "; ".join(f"{o.check.name}: {o.verdict.worst}" for o in failed)
+                verdicts.line(console, f"seed {seed}: {f'FAILED {words}' if failed else f'passed, p = {p:.3g}'}")
     found = _logged(log, about) or found            # other processes write to it, too
     lines, n = [found[seed] for seed in sorted(found)], len(found)
     alarms = sum(not line["passed"] for line in lines)
@@ -148,10 +154,20 @@ def _logged(log: Path | None, about: dict[str, Any]) -> dict[int, dict[str, Any]
     return found
 
 
-def _run(subject: Subject, checks: Sequence[Check]) -> list[Outcome]:
+@contextlib.contextmanager
+def _examiner(subject: Subject) -> Iterator[Run]:
+    """`suite.run`, for other people's code in another process."""
+    if subject.name in representations.BUILT_IN:
+        yield suite.run
+        return
+    with isolated.Examiner() as examiner:
+        yield examiner.run
+
+
+def _run(run: Run, subject: Subject, checks: Sequence[Check]) -> list[Outcome]:
     outcomes: list[Outcome] = []
     with Bar(len(checks)) as bar:
-        for outcome in suite.run(subject, checks):
+        for outcome in run(subject, checks):
             outcomes.append(outcome)
             bar.at(len(outcomes), outcome.check.name)
     return outcomes

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import representations
 from olpm_bench.check import density, kernel, learning, many_records, memory, purity, samples, unbiased
 from olpm_bench.check.population import population, population_with_parallax
 from olpm_bench.check.trained import Trained
@@ -24,7 +25,7 @@ DECLARATIONS = {"constant": "learns nothing on purpose", "grows": "keeps all of 
 
 
 class Subject:
-    """A representation under examination; its states are trained when a check first asks for them.
+    """A representation under examination; made, and its states trained, when a check first asks for them.
 
     Args:
         specification: as in a TOML, ``{"type": "gaussian_mixture", "components": 8}``.
@@ -32,21 +33,26 @@ class Subject:
         declared: of `DECLARATIONS`, what it does on purpose.
 
     Raises:
-        RepresentationError, InputError: there is no such representation, or declaration.
+        InputError: there is no such declaration.
     """
 
     def __init__(self, specification: dict[str, Any], seed: int = 0, declared: Sequence[str] = ()) -> None:
-        import representations
-
         for name in declared:
             if name not in DECLARATIONS:
                 raise InputError(f"--declare {name}: must be one of {', '.join(DECLARATIONS)}")
         self.specification, self.seed, self.declared = specification, seed, declared
-        self.representation = representations.create(**specification)
 
     @property
     def name(self) -> str:
         return str(self.specification["type"])
+
+    @cached_property
+    def representation(self) -> Any:
+        """
+        Raises:
+            RepresentationError: there is no such representation, or it can't be made.
+        """
+        return representations.create(**self.specification)
 
     @cached_property
     def trained(self) -> Trained:
@@ -127,7 +133,12 @@ def named(names: Sequence[str]) -> list[Check]:
 
 
 def run(subject: Subject, checks: Sequence[Check] = CHECKS, level: float = LEVEL) -> Iterator[Outcome]:
-    """One check after the other; an error in the representation's code is a failure of the check that meets it."""
+    """One check after the other; an error in the representation's code is a failure of the check that meets it.
+
+    Raises:
+        RepresentationError: it can't be made.
+    """
+    subject.representation      # noqa: B018
     for check in checks:
         start = time.perf_counter()
         try:

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from olpm_bench.bench import probe
+from olpm_bench.bench import other_process, probe
 from olpm_bench.scenes import SceneError
 
 CHILD = """
@@ -19,7 +19,7 @@ for line in sys.stdin:
 
 
 def test_a_process_that_dies_or_hangs_is_started_again():
-    with probe.Process([sys.executable, "-c", CHILD], seconds=5.0) as process:
+    with other_process.Process([sys.executable, "-c", CHILD], seconds=5.0) as process:
         assert process.ask("no") == {"refused": "no"} and process.ask("still no") == {"refused": "still no"}
         assert process.starts == 1
         assert process.ask("die") == {"died": -6}
@@ -34,7 +34,7 @@ def test_nothing_is_imported_from_the_folder_that_one_works_in(tmp_path, monkeyp
     monkeypatch.delenv("PYTHONPATH", raising=False)         # what it names is wanted, "." too
     (tmp_path / "json.py").write_text("open('was_run', 'w')")
     (tmp_path / "room.xml").write_text("<scene")
-    with probe.Process() as process:
+    with other_process.Process(probe.COMMAND) as process:
         assert "refused" in process.ask("room.xml", {})
     assert not (tmp_path / "was_run").exists()
 
@@ -43,7 +43,7 @@ def test_nothing_is_imported_from_the_folder_that_one_works_in(tmp_path, monkeyp
     ({"died": -11}, r"room\.xml: Mitsuba crashes when it loads it \(SIGSEGV\)"), ({"died": 1}, r"room\.xml: .* \(exit code 1\)"),
     ({"hung": 900.0}, r"room\.xml: Mitsuba has not loaded it after 900 s"), ({"refused": "no such scene"}, "^no such scene$")])
 def test_what_is_said_of_it(tmp_path, monkeypatch, answer, message):
-    monkeypatch.setattr(probe.Process, "ask", lambda *_: answer)
+    monkeypatch.setattr(other_process.Process, "ask", lambda *_: answer)
     (tmp_path / "room.xml").write_text("<scene/>")
     with pytest.raises(SceneError, match=message):
         probe.check(tmp_path / "room.xml", {})

@@ -1,7 +1,7 @@
 """A process that reads files, so that neither a crash nor a hang ends the test.
 
     with child() as process:
-        answer = process.ask("guide", "guide.npz")      # {"ok": true}, {"refused": "one line"}, {"traceback": ...}, {"died": -11}
+        answer = process.ask("guide", "guide.npz")      # {"ok": null}, {"refused": "one line"}, {"traceback": ...}, {"died": -11}
 
 Whatever Python opens for writing, makes, renames or removes must be below `results` beside the file, or in a cache of libraries:
 else there is a traceback that tells.
@@ -15,7 +15,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from olpm_bench.bench import probe
+from olpm_bench.bench import other_process, probe
 from olpm_bench.transport.settings import InputError
 
 SECONDS = 400.0                 # without an answer a file hangs the process
@@ -26,7 +26,7 @@ PATHS = {"os.rename": 2, "os.link": 2, "os.symlink": 2, "os.mkdir": 1, "os.trunc
 touched: list[str] = []         # what the file that is being read makes us write, make, rename or remove
 
 
-class Child(probe.Process):
+class Child(other_process.Process):
     """Counts what it answers, so that a campaign can say how many files were read, and how many refused."""
 
     def __init__(self) -> None:
@@ -133,4 +133,4 @@ def load(kind: str, path: str) -> None:
 if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_AS, (GIGABYTES << 30, GIGABYTES << 30))
     sys.addaudithook(note)
-    probe.serve(read)
+    other_process.serve(read)
