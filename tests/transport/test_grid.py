@@ -31,7 +31,7 @@ TRAINING = {"passes": 2, "photons": 50_000, "importons": 20_000, "record_radius"
 DEPTH = 6
 PASSES, SPP = 32, 64
 LEVEL = 0.01                # probability that all tests together fail although nothing is wrong
-SEEN = 0.25                 # largest bias that may go unseen on a BSDF; transmissive `principled` comes to 0.16
+SEEN = 0.25                 # largest bias that may go unseen on a BSDF; found: 0.16, with --grid 0.19
 METHODS = ("unguided", *representations.names())
 
 
@@ -150,7 +150,7 @@ def test_every_bsdf_under_every_emitter(room, method, request):
     found = compare(room, method, number_of_tests(rooms.values()), spp)
     print(f"{', '.join(room.emitters)}; {method}:", *found.lines(), sep="\n")
     assert not found.rejected, "\n".join(found.rejected.values())
-    assert np.median(found.seen) < 0.1 and (grid or found.seen.max() < SEEN), "\n".join(found.lines())
+    assert np.median(found.seen) < 0.1 and found.seen.max() < SEEN, "\n".join(found.lines())
 
 
 def _density_too_large(patch: pytest.MonkeyPatch) -> None:
