@@ -67,9 +67,11 @@ def summarise(finished: Finished) -> dict[str, Any]:
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
     `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, and `overrun` is the
     largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.  `gain` is the
-    baseline's work-normalised variance over the method's, with its 90 % jackknife interval, `worst_speed_up` by
-    `statistics.worst_speed_up`, and `apart` by `apart` from the baseline; `warnings` are those of training.  What has no value
-    (a spread of one seed, the error of a scene without reference) is None.
+    baseline's work-normalised variance over the method's, with its 90 % jackknife interval, `speed_up` how many times as fast
+    it is to equal L1 (at least, or at most, by `speed_up_bound` ">" or "<"), `worst_speed_up` by `statistics.worst_speed_up`,
+    `apart` by `apart` from the baseline, `memory` by `Cell.memory` [bytes], and `guided` the share of the surfaces that the
+    camera sees whose records have learnt enough to guide; `warnings` are those of training.  What has no value (a spread of one
+    seed, the error of a scene without reference, what a guide has without one) is None.
     """
     budget = finished.experiment.budget.seconds
     rows = [_row(scene, method, budget) for scene in finished.scenes for method in scene.cells]
@@ -102,12 +104,15 @@ def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, A
         "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
         "bytes_per_record", "particles", "mean", "mean_stderr", "charged_seconds")}
     l1, gain = statistics.median_band(final.errors["l1"]), final.gain
+    faster = scene.speed_ups.get(method, statistics.Interval(np.nan, np.nan, np.nan))
     return plain({
         "scene": scene.scene.name, "method": method, "seeds": [cell.seed for cell in cells],
         "l1": l1.median, "l1_low": l1.low, "l1_high": l1.high,
         **{name: np.median(values) for name, values in final.errors.items()},
         "work_normalised_variance": final.work_normalised_variance,
-        "gain": gain.value, "gain_low": gain.low, "gain_high": gain.high, "mean": np.mean(info["mean"]),
+        "gain": gain.value, "gain_low": gain.low, "gain_high": gain.high,
+        "speed_up": faster.value, "speed_up_low": faster.low, "speed_up_high": faster.high, "speed_up_bound": faster.bound,
+        "mean": np.mean(info["mean"]),
         "mean_stderr": np.sqrt(np.sum(info["mean_stderr"] ** 2)) / len(cells),      # seeds are independent
         "charged_seconds": np.median(info["charged_seconds"]),
         "overrun": np.max(info["charged_seconds"]) / budget - 1 if budget is not None else None,
@@ -117,6 +122,7 @@ def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, A
         "spp": _whole(np.median(info["spp"])), "records": _whole(np.median(info["records"])),
         "bytes_per_record": _whole(np.median(info["bytes_per_record"])),
         "particles": _whole(np.median(info["particles"])),
+        "memory": _median([cell.memory() for cell in cells]), "guided": _median([cell.info.get("trained") for cell in cells]),
         "worst_speed_up": scene.worst_speed_ups.get(method),
         "apart": apart(cells, scene.cells[scene.baseline]),
         "noise_floor": scene.reference.noise_floor if scene.reference is not None else None,
@@ -126,6 +132,12 @@ def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, A
 
 def _whole(value: np.floating) -> int:
     return round(float(value))
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    """None where a cell says nothing, as older ones do."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if len(known) == len(values) else None
 
 
 def write(summary: dict[str, Any], results: Results) -> None:

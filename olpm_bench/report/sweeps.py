@@ -4,7 +4,6 @@ Reads results, renders nothing.  Methods without a sweep are level lines.
 """
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -13,11 +12,8 @@ import numpy as np
 from olpm_bench.bench import statistics
 from olpm_bench.bench.config import Experiment, Method, Series
 from olpm_bench.bench.finished import Finished, FinishedScene
-from olpm_bench.bench.results import Cell
 from olpm_bench.bench.sweep import short
 from olpm_bench.report import figures, sheet
-
-FIELD_BYTES = {"mi.Float": 16, "mi.UInt32": 4}      # of a field of `Particles`, for each: four numbers, or one index
 
 LABELS = {"l1": "L1 error", "relmse": "relMSE", "bytes": "memory of learning [MB]", "train_seconds": "training [s]"}
 ERRORS = ("l1", "relmse")
@@ -98,20 +94,8 @@ def _values(scene: FinishedScene, method: str, quantity: str) -> list[float]:
     if quantity in ERRORS:
         return [float(error) for error in scene.final[method].errors[quantity]]
     if quantity == "bytes":
-        return [_bytes(cell) / 1e6 for cell in scene.cells[method]]
+        return [(cell.memory() or 0) / 1e6 for cell in scene.cells[method]]
     return [float(cell.info[quantity]) for cell in scene.cells[method]]
-
-
-def _bytes(cell: Cell) -> int:
-    stored = max((done["stored"] for done in cell.info["passes"]), default=0)
-    return int(cell.info["records"] * cell.info["bytes_per_record"] + bytes_per_particle() * stored)
-
-
-def bytes_per_particle() -> int:
-    """What a particle takes while it is stored; without the places that are kept free for particles that may split."""
-    from olpm_bench.transport.particles import Particles  # imports Mitsuba
-
-    return sum(FIELD_BYTES.get(str(field.type), 0) for field in dataclasses.fields(Particles))
 
 
 def _abscissa(experiment: Experiment) -> str:

@@ -102,6 +102,20 @@ def test_a_cell_in_the_folder_of_another_is_not_believed(tmp_path):
         results.read_cell("a scene", "GMM, K = 8", 1)
 
 
+def test_cells_of_earlier_versions_are_read(tmp_path):
+    """Their digest of cell.json left the key out."""
+    file = write_cell(Results(tmp_path)).folder / "cell.json"
+    info = json.loads(file.read_text())
+    digests = info.pop("digests")
+    older = digest(json.dumps({name: value for name, value in info.items() if name != "key"}, sort_keys=True).encode())
+    assert "key" in info and older != digests["cell.json"]
+    write_json(file, info | {"digests": digests | {"cell.json": older}})
+    assert Results(tmp_path).verified_cell("a scene", "GMM, K = 8", 0) is not None
+    write_json(file, info | {"charged_seconds": 2.5, "digests": digests | {"cell.json": older}})
+    with pytest.raises(ResultError, match=r"cell\.json is broken: its digest is another"):
+        Results(tmp_path).read_cell("a scene", "GMM, K = 8", 0)
+
+
 def test_a_checkpoint_too_few_is_noticed(tmp_path):
     cell = write_cell(Results(tmp_path), checkpoints=3)
     trace = cell.folder / "trace.jsonl"

@@ -19,9 +19,10 @@ from olpm_bench.bench.results import Results
 from olpm_bench.transport.settings import IntegratorSettings
 
 KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "mape", "smape", "relmse", "relmse_trimmed", "flip", "ssim_error",
-        "work_normalised_variance", "gain", "gain_low", "gain_high", "mean", "mean_stderr", "charged_seconds", "overrun",
-        "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
-        "bytes_per_record", "particles", "worst_speed_up", "apart", "noise_floor", "warnings"]
+        "work_normalised_variance", "gain", "gain_low", "gain_high", "speed_up", "speed_up_low", "speed_up_high",
+        "speed_up_bound", "mean", "mean_stderr", "charged_seconds", "overrun", "training_passes", "train_seconds",
+        "render_seconds", "compile_seconds", "wait_fraction", "spp", "records", "bytes_per_record", "particles", "memory",
+        "guided", "worst_speed_up", "apart", "noise_floor", "warnings"]
 ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
 TIMES = [1.0, 4.0, 16.0]
 
@@ -105,7 +106,8 @@ def without_reference(known, **changes) -> SimpleNamespace:
 def test_a_scene_without_reference_has_no_errors_but_all_the_rest(known):
     rows, expected = summarised(without_reference(known))["rows"], summarised(known)["rows"]
     for row, full in zip(rows, expected, strict=True):
-        errors = [*KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1], "worst_speed_up", "noise_floor"]
+        errors = [*KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1], "speed_up", "speed_up_low", "speed_up_high",
+                  "worst_speed_up", "noise_floor"]
         assert [row[key] for key in errors] == [None] * len(errors)
         assert {k: v for k, v in row.items() if k not in errors} == {k: v for k, v in full.items() if k not in errors}
     assert finished.read(without_reference(known).experiment, known.results, {}).speed_ups == {"Fast": {}}

@@ -10,7 +10,7 @@ import pytest
 from skimage.io import imread
 from texts import assert_readable, rendered, visible
 
-from olpm_bench.bench import config, experiment_file
+from olpm_bench.bench import config, experiment_file, results
 from olpm_bench.bench.finished import Finished, read
 from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Results
@@ -110,7 +110,7 @@ def test_memory_over_the_photons_traced(tmp_path, drawn):
     assert memory.abscissa == "photons traced" and list(memory.curves) == ["Stored", "On-line"] == list(seconds.curves)
     for curve in memory.curves.values():
         np.testing.assert_array_equal(curve.times, [1000, 4000, 16_000])
-    a_pass = 10_000 * sweeps.bytes_per_particle() / 1e6
+    a_pass = 10_000 * results.bytes_per_particle() / 1e6
     np.testing.assert_allclose(memory.curves["Stored"].median, 0.02 + a_pass * np.array([1, 4, 16]))
     np.testing.assert_allclose(memory.curves["On-line"].median, 0.02 + a_pass)
     np.testing.assert_allclose(seconds.curves["On-line"].median, [0.5, 2, 8])
@@ -126,7 +126,7 @@ def test_the_bytes_of_a_particle_are_those_of_the_arrays_that_hold_it():
     shared = photons.position, photons.direction, photons.normal
     assert photons.place.numpy().max() < room and len(photons) > n
     per_hit = sum(array.numpy().nbytes for array in shared) / room + photons.place.numpy().nbytes / len(photons)
-    assert sweeps.bytes_per_particle() == per_hit
+    assert results.bytes_per_particle() == per_hit
 
 
 def test_no_text_overlaps_another_or_leaves_the_figure(tmp_path, drawn):
