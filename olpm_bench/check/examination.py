@@ -16,7 +16,7 @@ from scipy import stats
 import representations
 from olpm_bench.bench.config import own_code
 from olpm_bench.bench.files import ResultError, digest, plain, slug
-from olpm_bench.bench.progress import Bar, is_interrupt
+from olpm_bench.bench.progress import Bar
 from olpm_bench.check import isolated, suite
 from olpm_bench.check.suite import LEVEL, Check, Outcome, Subject
 from olpm_bench.report import verdicts
@@ -174,19 +174,14 @@ def _run(run: Run, subject: Subject, checks: Sequence[Check]) -> list[Outcome]:
 
 
 def _draw(outcome: Outcome, subject: Subject, folder: Path) -> Path | None:
-    """The picture of a failure; None if it passed, has none, the representation can't even be asked for it, or it can't be
-    written: verdicts do not depend on pictures."""
-    verdict = outcome.verdict
-    if verdict.passed or verdict.picture is None:
+    """The picture of a failure; None if there is none, or it can't be written: verdicts do not depend on pictures."""
+    panels = outcome.verdict.panels()
+    if not panels:
         return None
     path = folder / slug(Path(subject.name.replace(":", "-")).name) / f"{outcome.check.name}.png"
     try:
-        verdicts.picture(verdict.picture(), f"{subject.name}, {outcome.check.name}: {verdict.worst}", path)
-        return path
+        verdicts.picture(panels, f"{subject.name}, {outcome.check.name}: {outcome.verdict.worst}", path)
     except OSError as error:
         print(f"olpm-bench: no picture of {outcome.check.name}: {error}", file=sys.stderr)
         return None
-    except Exception as error:          # other people's code, which has failed before
-        if is_interrupt(error):
-            raise
-        return None
+    return path

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from olpm_bench.bench import other_process
-from olpm_bench.bench.progress import is_interrupt
 from olpm_bench.check import suite
 from olpm_bench.check.suite import Check, Outcome, Subject
 from olpm_bench.check.verdict import Panel, Verdict
@@ -50,10 +49,8 @@ def _verdict(answer: dict[str, Any]) -> Verdict:
     if "died" in answer:
         return Verdict(False, "dies", None, None, f"ends the process ({other_process.end(answer)}): does it read out of bounds?")
     fields, panels = answer["ok"]
-    verdict = Verdict(**fields)
-    if panels:
-        verdict.picture = lambda: [Panel(**{**panel, "values": np.array(panel["values"], float)}) for panel in panels]
-    return verdict
+    drawn = [Panel(**{**panel, "values": np.array(panel["values"], float)}) for panel in panels]
+    return Verdict(**fields, picture=lambda: drawn)
 
 
 @functools.lru_cache(maxsize=1)         # its states serve all checks
@@ -65,14 +62,7 @@ def _examine(specification: dict[str, Any], seed: int, declared: Sequence[str], 
     """The fields of a verdict, and of the panels of its picture."""
     subject = _subject(json.dumps(specification), seed, tuple(declared))
     verdict = next(suite.run(subject, suite.named([name]))).verdict
-    panels = None
-    try:
-        if not verdict.passed and verdict.picture is not None:
-            panels = [asdict(panel) for panel in verdict.picture()]
-    except Exception as error:          # other people's code, which has failed before
-        if is_interrupt(error):
-            raise
-    return verdict.as_dict(), panels
+    return verdict.as_dict(), [asdict(panel) for panel in verdict.panels()]
 
 
 if __name__ == "__main__":

@@ -71,14 +71,13 @@ def _compare(representation: Any, state: Any, axis: np.ndarray, aside: bool, lev
     a = np.where((reported > 0) & (x[:, 2] > 0), q_x / (q_x + f_x), 0)
     b = np.where(y[:, 2] > 0, f_y / (q_y + f_y), 0)
     # A lane's x and y are of the same record: a - b has the mean 0, and the variance E (a - b)^2.  Of blocks and lanes the
-    # numbers of terms are fixed; of bins they are not (see `chi_square`).
+    # numbers of terms are fixed; of bins they are not, and E (a^2 + b^2) = E a = E b stands for it (see `follow_pdf`).
     apart, block, lane, in_x, in_y = (a - b) ** 2, record * BINS**2 // n, np.arange(lanes) % PACKET, bin_of(x), bin_of(y)
     p_values = PValues()
-    for what, of_x, of_y, squares in (("blocks of records", block, block, [(block, apart)]),
-                                      ("lanes of a packet", lane, lane, [(lane, apart)]),
-                                      ("bins of the square", in_x, in_y, [(in_x, a**2), (in_y, b**2)])):
+    for what, of_x, of_y in (("blocks of records", block, block), ("lanes of a packet", lane, lane),
+                             ("bins of the square", in_x, in_y)):
         sampled, expected = np.bincount(of_x, a, BINS**2), np.bincount(of_y, b, BINS**2)
-        variance = np.sum([np.bincount(index, square, BINS**2) for index, square in squares], axis=0)
+        variance = np.bincount(of_x, apart, BINS**2) if of_x is of_y else (sampled + expected) / 2
         chi2, bins, worst = chi_square(sampled, expected, variance, FEWEST)
         words = (f"{n} records: chi-square {chi2:.0f} over {bins} {what}; worst is number {worst}: {sampled[worst]:.0f} sampled, "
                  f"{expected[worst]:.0f} by the pdf")

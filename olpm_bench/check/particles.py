@@ -113,7 +113,8 @@ def batch(particles: list[Particles], parallax: bool = False, far: bool = False)
     record = np.repeat(np.arange(len(particles), dtype=np.uint32), [len(p[1]) for p in particles])
     if not parallax:
         return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles))
-    at, distance = (np.concatenate(values).astype(np.float32) for values in zip(*(landing(p[0]) for p in particles), strict=True))
+    landed = zip(*(landing(p[0]) for p in particles if len(p[1])), strict=True)
+    at, distance = (np.concatenate(values).astype(np.float32) for values in landed)
     distance = np.full_like(distance, np.inf) if far else distance
     return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles), mi.Float(distance),
                                      vector(at))

@@ -74,18 +74,20 @@ class Population:
 
     @functools.cached_property
     def proposals(self) -> Proposals:
-        return Proposals([self._seen(r) for r in range(len(self))], self.rng(1))
+        return Proposals(self._seen(), self.rng(1))
 
-    def _seen(self, record: int) -> Particles:
-        """A record's particles from where it is asked."""
-        wo, weight = self.of(record)
-        if self.at is not None and len(wo):
-            parts = [landing(b[record][0]) for b in self.batches]
-            place, distance = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
-            x, y, z, near = aim(tuple(vector(wo)), inverse(mi.Float(distance)), -vector(place))
-            at = mi.Vector3f(*map(float, self.at[record]))
-            wo = normalised(np.stack([np.array(c) for c in aim((x, y, z), near, at)[:3]], -1))
-        return wo, weight
+    def _seen(self) -> list[Particles]:
+        """Each record's particles, from where it is asked."""
+        particles = [self.of(record) for record in range(len(self))]
+        if self.at is None:
+            return particles
+        count = [len(weight) for _, weight in particles]
+        landed = [landing(b[record][0]) for record in range(len(self)) for b in self.batches if len(b[record][1])]
+        place, distance = (np.concatenate(values) for values in zip(*landed, strict=True))
+        learnt = vector(np.concatenate([wo for wo, _ in particles]))
+        *centred, near = aim(tuple(learnt), inverse(mi.Float(distance)), -vector(place))
+        seen = np.array(aim(tuple(centred), near, vector(np.repeat(self.at, count, axis=0)))[:3]).T
+        return list(zip(np.split(normalised(seen), np.cumsum(count)[:-1]), [weight for _, weight in particles], strict=True))
 
     @functools.cached_property
     def counts(self) -> np.ndarray:

@@ -64,10 +64,11 @@ class Proposals:
 
     def pdf(self, record: np.ndarray, wo: np.ndarray) -> np.ndarray:
         """q at directions above the horizon [n]."""
-        first, count = self.first[record], self.count[record]
+        order = np.argsort(record, kind="stable")           # neighbours loop over the same particles
+        first, count = self.first[record[order]], self.count[record[order]]
         axes, mass = vector(self.axis), mi.Float(self.mass.astype(np.float32))
         i, end = mi.UInt32(first.astype(np.uint32)), mi.UInt32((first + count).astype(np.uint32))
-        direction = vector(wo)
+        direction = vector(wo[order])
 
         def add(i: mi.UInt32, found: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             c2 = dr.squared_norm(dr.gather(mi.Vector3f, axes, i) - direction)
@@ -75,5 +76,6 @@ class Proposals:
             return i + 1, found + dr.select(inside, dr.gather(mi.Float, mass, i) / c2, 0)
 
         _, found = dr.while_loop((i, dr.zeros(mi.Float, len(wo))), lambda i, _: i < end, add, mode="symbolic")
-        share = np.where(count > 0, 0.5, 0)
-        return (1 - share) / (2 * np.pi) + share / (2 * np.pi * LOG_RANGE) * np.array(found, np.float64)
+        share, q = np.where(count > 0, 0.5, 0), np.empty(len(wo))
+        q[order] = (1 - share) / (2 * np.pi) + share / (2 * np.pi * LOG_RANGE) * np.array(found, np.float64)
+        return q

@@ -57,18 +57,21 @@ def follow_pdf(trained: Trained, level: float) -> Verdict:
     both estimate the integral of f q / (q + f) over B if x follows f, and neither has terms above 1.
 
     A record's x and y are independent draws, and their numbers are fixed: the variance of a mean of terms t over n of them is
-    (E t^2 - (E t)^2) / n.  So it is for the sum over all bins; in the bins E t^2 / n stands for it (see `chi_square`).
+    (E t^2 - (E t)^2) / n.  So it is for the sum over all bins; in the bins E t^2 / n stands for it (see `chi_square`).  Of both
+    means together that is the integral over B of (f q^2 + q f^2) / (q + f)^2, which is the integral of f q / (q + f) again: a
+    bin's variance is its own mean over n.  Squares of few terms would be a poor estimate: where q is a hundredth of f, one y in
+    place of hundreds of x holds all of the variance, and a bin may have none.
     """
     records, d, p = trained.records, trained.drawn, trained.records.proposed
     above = d.alive & (d.wo[:, 2] > 0)
     record, wo, f_x, f_y = d.record[above], d.wo[above], d.pdf[above], trained.proposed
     q_x = records.proposals.pdf(record, wo)
-    sampled, square_x = _binned(q_x / (q_x + f_x), record, wo, records.counts)
-    expected, square_y = _binned(f_y / (p.q + f_y), p.record, p.wo, records.counts)
-    square, p_values = square_x + square_y, PValues()
-    variance = square.sum(1) - (sampled.sum(1) ** 2 + expected.sum(1) ** 2) / records.counts
+    sampled, variance_x = _binned(q_x / (q_x + f_x), record, wo, records.counts)
+    expected, variance_y = _binned(f_y / (p.q + f_y), p.record, p.wo, records.counts)
+    variance, p_values = variance_x + variance_y, PValues()
     for r in range(len(records)):
-        chi2, bins, worst = chi_square(sampled[r], expected[r], square[r], FEWEST / records.counts[r])
+        n = records.counts[r]
+        chi2, bins, worst = chi_square(sampled[r], expected[r], (sampled[r] + expected[r]) / (2 * n), FEWEST / n)
         wo = _centre(worst)
         words = f"{records.name(r)}: chi-square {chi2:.0f} for {bins} bins, worst around {direction(wo)}"
         p_values.add(stats.chi2.sf(chi2, bins), words, of_record(trained, r, wo))
@@ -80,10 +83,10 @@ def follow_pdf(trained: Trained, level: float) -> Verdict:
 
 
 def _binned(terms: np.ndarray, record: np.ndarray, wo: np.ndarray, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means over a record's trials of the terms in each bin, and of their squares over the trials [n_records, BINS^2]."""
-    index, shape, trials = record * BINS**2 + bin_of(wo), (len(trials), BINS**2), trials[:, None]
-    mean, square = (np.bincount(index, t, shape[0] * shape[1]).reshape(shape) / trials for t in (terms, terms**2))
-    return mean, square / trials
+    """Means over a record's trials of the terms in each bin [n_records, BINS^2], and the variance of their sum [n_records]."""
+    n = len(trials)
+    mean = np.bincount(record * BINS**2 + bin_of(wo), terms, n * BINS**2).reshape(n, BINS**2) / trials[:, None]
+    return mean, (np.bincount(record, terms**2, n) / trials - mean.sum(1) ** 2) / trials
 
 
 def chi_square(sampled: np.ndarray, expected: np.ndarray, variance: np.ndarray, fewest: float) -> tuple[float, int, int]:

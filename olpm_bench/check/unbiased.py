@@ -40,7 +40,8 @@ def keep_the_image(specification: dict[str, Any], seed: int, level: float) -> Ve
     """A box lit indirectly, with a glossy sphere in it: the image is that of Mitsuba's `path`."""
     glossy = {"type": "roughconductor", "alpha": 0.15}
     sphere = {"type": "sphere", "center": [-0.35, 0.3, -0.5], "radius": 0.4, "bsdf": glossy}
-    scene = mi.load_dict(box(grey(0.6), lamp=lamp(), sphere=sphere), optimize=False)
+    content = box(grey(0.6), lamp=lamp(), sphere=sphere)
+    scene = mi.load_dict(content, parallel=False, optimize=False)       # in one order, which has the same kernels each time
     reference = passes(scene, mi.load_dict({"type": "path", "max_depth": DEPTH}), PASSES, SPP, _seed(seed) + PASSES)
     p_values, skewness = PValues(), 0.0
     for how, guide in _guides(scene, specification, seed):

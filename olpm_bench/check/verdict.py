@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from olpm_bench.bench.progress import is_interrupt
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -49,6 +51,17 @@ class Verdict:
     def as_dict(self) -> dict[str, Any]:
         """For JSON: all but the picture."""
         return {k: v for k, v in vars(self).items() if k != "picture"}
+
+    def panels(self) -> list[Panel]:
+        """Those of a failure's picture; none if the representation, which has failed before, can't even be asked for it."""
+        if self.passed or self.picture is None:
+            return []
+        try:
+            return self.picture()
+        except Exception as error:
+            if is_interrupt(error):
+                raise
+            return []
 
 
 def sidak(level: float, tests: int) -> float:

@@ -46,9 +46,9 @@ def test_it_finds_what_the_same_checks_find_in_this_process() -> None:
         there = list(examiner.run(subject, checks))
         assert examiner.starts == 1
     assert [o.verdict.as_dict() for o in there] == [o.verdict.as_dict() for o in here]
-    assert [o.verdict.passed for o in here] == [True, False] and there[0].verdict.picture is None
-    assert here[1].verdict.picture is not None and there[1].verdict.picture is not None
-    for a, b in zip(here[1].verdict.picture(), there[1].verdict.picture(), strict=True):
+    assert [o.verdict.passed for o in here] == [True, False] and there[0].verdict.panels() == []
+    assert here[1].verdict.panels()
+    for a, b in zip(here[1].verdict.panels(), there[1].verdict.panels(), strict=True):
         assert np.array_equal(a.values, b.values, equal_nan=True)
         assert (a.title, a.scale, a.unit) == (b.title, b.scale, b.unit) and np.array_equal(a.mark, b.mark)
 

@@ -7,10 +7,11 @@ import pytest
 from scipy import stats
 
 from olpm_bench.check import many_records, population, samples
-from olpm_bench.check.particles import equal, lobes, nothing
+from olpm_bench.check.particles import equal, lobes, nothing, uniform_directions
 from olpm_bench.check.trained import Trained
 from olpm_bench.check.verdict import PValues
 from representations.cosine import CosineLobe
+from representations.hey import HeyCones
 from representations.jensen import JensenHistogram
 
 SEEDS, LEVEL = 24, 1e-3
@@ -50,6 +51,16 @@ def test_p_values_are_uniform_if_nothing_is_wrong(representation, p_values) -> N
     for kind in ("sum", "lanes", "blocks"):
         assert stats.kstest(p_values[kind], "uniform").pvalue > LEVEL, (kind, np.sort(p_values[kind]))
     assert len(p_values["sum"]) == 4 * SEEDS + 3 * (SEEDS // 3)
+    assert stats.kstest(p_values["bins"], "uniform", alternative="greater").pvalue > LEVEL
+
+
+def test_bins_at_the_rim_of_a_lobe_raise_no_alarm(p_values) -> None:
+    """There the pdf may be a hundred times the proposals', and one of these, or none, faces hundreds of samples."""
+    rng = np.random.default_rng(0)
+    ten_identical = [equal(np.repeat(uniform_directions(1, rng), 10, axis=0)) for _ in range(256)]
+    records = population.Population(["ten identical"] * len(ten_identical), [ten_identical], 0)
+    samples.follow_pdf(Trained(HeyCones(), records), 0.01)
+    assert min(p_values["bins"]) > LEVEL / len(ten_identical)
     assert stats.kstest(p_values["bins"], "uniform", alternative="greater").pvalue > LEVEL
 
 
