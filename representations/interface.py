@@ -4,16 +4,21 @@ A representation is a family of probability densities over the upper hemisphere,
 of a spatial cache, all held in one structure of arrays.  Hyper-parameters are attributes of an ordinary class;
 what is learnt is a separate *state*: a plain dataclass whose fields are flat Dr.Jit arrays of
 ``n_records * stride`` entries, record-major, with a stride that never changes.  So the owner of the records
-can append new ones, save, load and count the bytes of any state without knowing what it means
-(:mod:`representations.state`).
+can append new ones, begin them as copies of others, save, load and count the bytes of any state without
+knowing what it means (:mod:`representations.state`); a state may hold no index of a record.
 
 Sign convention (the only place it is stated): a direction ``wo`` is a unit vector in the record's own frame
 (s, t, n), n = (0, 0, 1), and points *away from the surface*, to where light comes from or importance comes
-from.  Densities are per solid angle [1/sr] and zero for ``wo.z <= 0``.
+from.  Densities are per solid angle [1/sr] and zero for ``wo.z <= 0``.  Lengths are 1 up to rounding:
+``wo.z`` may be 1 + 2^-22.
 
 Parallax: a record is asked about points around its own.  Those who know where say it by ``at``, the point in the record's
 frame, whose origin is the record's position; a representation that knows how far away its light is re-aims it from there
-(Ruppert et al. 2020), others may ignore ``at``.  Without it, all points see what the record sees.
+(Ruppert et al. 2020), others may ignore ``at``.  Without it, all points see what the record sees.  Only states made for
+parallax are asked at points, and taught batches that have them.  Records are made where particles land: ``at`` may be 0.
+
+Lanes that are not ``active`` may ask for records that don't exist: nothing may be read there, and nothing is made of what
+they return.
 """
 from __future__ import annotations
 
@@ -141,8 +146,9 @@ class DirectionalPdf(Protocol[State]):
 
         First fit and on-line update are this one verb.  Pure: the argument is left alone and the result depends
         on nothing but the arguments.  A record without particles in the batch keeps its density.  Zero weights
-        teach nothing, and a batch may be empty.  The batch is never seen again.  Sums over particles must be taken in
-        their order (as `jensen` does, a lane a record), not by `scatter_add`, whose rounding depends on threads.
+        teach nothing.  A batch may be empty (return early: Dr.Jit doesn't combine arrays of 0 and 1 entries); its
+        directions lie above the horizon; it is never seen again.  Sums over particles must be taken in their order (as
+        `jensen` does, a lane a record), not by `scatter_add`, whose rounding depends on threads.
         """
         ...
 

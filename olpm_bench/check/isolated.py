@@ -47,7 +47,7 @@ def _verdict(answer: dict[str, Any]) -> Verdict:
     if "hung" in answer:
         return Verdict(False, "hangs", None, None, f"does not come back within {answer['hung']:.0f} s")
     if "died" in answer:
-        return Verdict(False, "dies", None, None, f"ends the process ({other_process.end(answer)}): does it read out of bounds?")
+        return Verdict(False, "dies", None, None, f"ends the process: {other_process.end(answer)}")
     fields, panels = answer["ok"]
     drawn = [Panel(**{**panel, "values": np.array(panel["values"], float)}) for panel in panels]
     return Verdict(**fields, picture=lambda: drawn)

@@ -16,7 +16,7 @@ from olpm_bench.check.trained import as_numpy
 from olpm_bench.check.verdict import Panel, PValues, Verdict
 from representations.interface import ParticleBatch
 
-RECORDS = 1 << 12           # with one particle each
+RECORDS = 4093              # with one particle each; a prime, as in `many_records`
 LANES = 1 << 22             # samples of all records
 FARTHEST = 8.0              # a step multiplies or divides the area within a sample's distance from the particle by up to this
 OCTAVES = 40                # of that area

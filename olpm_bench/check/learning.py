@@ -64,7 +64,7 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
 
     All of them count: directions of the left half of a density, then of the right half, in one batch or in many, teach more than
     either half.  So do their weights: of particles and more, but lighter uniform decoys, the density is half of either, and the
-    weights teach that, not their square roots or squares.
+    weights teach that, not their square roots or squares, nor their products with the cosine, which they contain already.
 
     `constant`: declared to learn nothing.
     """
@@ -94,9 +94,9 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
     def batches(directions: np.ndarray, n: int = 1) -> list[list[Particles]]:
         return [[equal(d) for d in part] for part in np.split(directions, n, axis=1)]
 
-    def among_decoys(power: float) -> list[list[Particles]]:
-        each = (np.repeat([1, LIGHT], [half, len(decoys)]) ** power).astype(np.float32)
-        return [[(np.concatenate([p[:half], decoys])[order], each[order]) for p, order in zip(particles, orders, strict=True)]]
+    def among_decoys(change: Callable[..., Any] = lambda weight, wo: weight) -> list[list[Particles]]:
+        given, weight = [np.concatenate([p[:half], decoys]) for p in particles], np.repeat([1, LIGHT], [half, len(decoys)])
+        return [[(wo[order], change(weight, wo).astype(np.float32)[order]) for wo, order in zip(given, orders, strict=True)]]
 
     some, half = particles[:, :COUNTS[1]], COUNTS[1] // 2
     decoys = uniform_directions(round(half / LIGHT), rng)
@@ -105,14 +105,16 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
     in_turn = np.take_along_axis(some, np.argsort(x > np.median(x, axis=1, keepdims=True), axis=1, kind="stable"), axis=1)
     counts = {n: f"{n} particles" for n in (0, *COUNTS)}
     none, few, once, most = counts.values()
-    weights, powers = "the weights", {"their square roots": 0.5, "their squares": 2.0}
+    weights, changes = "its weights", {
+        "their square roots": lambda weight, wo: weight**0.5, "their squares": lambda weight, wo: weight**2,
+        "weights times cosine": lambda weight, wo: weight * wo[:, 2], "weights over cosine": lambda weight, wo: weight / wo[:, 2]}
     online, both = f"{once} in {PARTS} batches", "its left half, then the right"
     both_online = f"{both}, in {PARTS} batches"
     lessons = {none: [], **{counts[n]: batches(particles[:, :n]) for n in COUNTS}, online: batches(some, PARTS),
-               weights: among_decoys(1), **{what: among_decoys(power) for what, power in powers.items()},
+               weights: among_decoys(), **{what: among_decoys(change) for what, change in changes.items()},
                "its left half": batches(in_turn[:, :half]), "its right half": batches(in_turn[:, half:]),
                both: batches(in_turn), both_online: batches(in_turn, PARTS)}
-    found = {what: likelihood(teach(given), *((half_uniform, LITTLE) if what in (weights, *powers) else (wo, 0.5)))
+    found = {what: likelihood(teach(given), *((half_uniform, LITTLE) if what in (weights, *changes) else (wo, 0.5)))
              for what, given in lessons.items()}
 
     def picture(name: str, what: str) -> Picture:
@@ -122,13 +124,13 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
     note = (f"mean ln q {', '.join(f'{found[what].mean():.3f} ({n})' for n, what in counts.items())} particles; {COUNTS[1]} "
             f"in {PARTS} batches instead of 1 lose {', '.join(f'{v:.3f} ({name})' for v, name in loss)}")
     if constant:
-        same = all(np.array_equal(v, found[weights if what in powers else none]) for what, v in found.items() if what != weights)
+        same = all(np.array_equal(v, found[weights if what in changes else none]) for what, v in found.items() if what != weights)
         return Verdict(same, "densities that learn", float(not same), 0.0, "" if same else "it was declared constant, but learns",
                        note=f"{note}{', as declared' if same else ''}")
 
     asked: list[tuple[str, str, float, Callable[..., Any]]] = [
         *((what, none, LEAST, np.min) for what in (once, most, online)),
-        *((weights, other, LEAST, np.mean) for other in powers),
+        *((weights, other, LEAST, np.mean) for other in changes),
         *((what, over, MORE, np.max) for what in (both, both_online) for over in ("its left half", "its right half"))]
     missed = []
     for what, over, least, judge in asked:

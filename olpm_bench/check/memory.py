@@ -1,29 +1,40 @@
-"""Learning takes no more memory with more particles."""
+"""Learning takes no more memory with more particles, or with more batches."""
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import drjit as dr
 import numpy as np
 
 from olpm_bench.check.particles import MILLION, many
-from olpm_bench.check.purity import Trials, both
-from olpm_bench.check.verdict import Verdict
+from olpm_bench.check.purity import Trials
+from olpm_bench.check.trained import Trained
+from olpm_bench.check.verdict import Verdict, worst_of
 from representations.state import bytes_of
 
 COUNTS = (100, 10_000, MILLION)     # particles of each of two records, one batch after the other
 
 
-@both
-def stay_bounded(trials: Trials) -> Verdict:
-    """Bytes of a record don't depend on how many particles it has seen, unless it is declared that they grow."""
+def stay_bounded(trials: Sequence[Trials], trained: Sequence[Trained]) -> Verdict:
+    """Bytes of a record don't depend on how many particles it has seen, nor in how many batches, unless it is declared that they
+    grow: in few large batches, and in all those of a population.
+    """
+    return worst_of({"with parallax" if one.parallax else "": _stay_bounded(one, late)
+                     for one, late in zip(trials, trained, strict=True)})
+
+
+def _stay_bounded(trials: Trials, trained: Trained) -> Verdict:
     rng, state = np.random.default_rng([11, trials.seed]), trials.init(2, trials.seed)
-    seen, found = [0], [bytes_of(state) / 2]
+    seen, found = 0, {"at first": bytes_of(state) / 2}
     for index, n in enumerate(COUNTS):
         state = trials.update(state, [many(n, rng)] * 2, trials.seed + index)
         dr.eval(state)
-        seen.append(seen[-1] + n)
-        found.append(bytes_of(state) / 2)
-    bounded = len(set(found)) == 1
-    words = f"{', '.join(f'{b:.0f} bytes after {n}' for n, b in zip(seen, found, strict=True))} particles a record"
-    note = f"{found[0]:.0f} bytes a record, whatever it has seen" if bounded else words
-    return Verdict(bounded or trials.grows, "bytes a record, over those at first", max(found) / max(found[0], 1),
+        seen += n
+        found[f"after {seen} particles"] = bytes_of(state) / 2
+    found[f"after {len(trained.records.batches)} batches"] = bytes_of(trained.state) / len(trained.records)
+    first, most = found["at first"], max(found.values())
+    bounded = len(set(found.values())) == 1
+    words = ", ".join(f"{size:.0f} bytes a record {when}" for when, size in found.items())
+    note = f"{first:.0f} bytes a record, whatever it has seen" if bounded else words
+    return Verdict(bounded or trials.grows, "bytes a record, over those at first", most / max(first, 1),
                    None if trials.grows else 1.0, words, note=f"{note}{', as declared' if trials.grows and not bounded else ''}")

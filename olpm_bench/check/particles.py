@@ -70,6 +70,16 @@ def many(n: int, rng: np.random.Generator) -> Particles:
     return lobes(n, rng), rng.lognormal(size=n).astype(np.float32)
 
 
+def weighty(particles: Particles, rng: np.random.Generator) -> Particles:
+    """A few of equal weights, which together weigh as much as the given ones."""
+    return lobes(8, rng), np.full(8, particles[1].sum() / 8, np.float32)
+
+
+def and_few(batches: list[Particles], rng: np.random.Generator) -> list[Particles]:
+    """Batches, and one of few `weighty` particles: who puts off the work for small batches is out of date."""
+    return [*batches, weighty(batches[-1], rng)]
+
+
 # Condition -> the batches of a record in it; `copy` numbers the records of a condition.
 Condition = Callable[[np.random.Generator, int], list[Particles]]
 CONDITIONS: dict[str, Condition] = {
@@ -84,10 +94,10 @@ CONDITIONS: dict[str, Condition] = {
     "many modes": lambda rng, copy: [many(400, rng)],
     "on-line": lambda rng, copy: [many(120, rng) for _ in range(BATCHES)],
     "none at first": lambda rng, copy: [nothing(), nothing(), many(200, rng)],
-    "more than a thousand": lambda rng, copy: [many(100, rng), many(1_500, rng)],
+    "more than a thousand": lambda rng, copy: and_few([many(100, rng), many(1_500, rng)], rng),
 }
 LONG: dict[str, Condition] = {          # that take time, of one record each
-    "a million": lambda rng, copy: [many(100, rng), many(MILLION, rng)],
+    "a million": lambda rng, copy: and_few([many(100, rng), many(MILLION, rng)], rng),
     "late": lambda rng, copy: [many(5, rng) for _ in range(LATE)],      # as many as `Proposals` look around
 }
 

@@ -29,6 +29,7 @@ ASKED = {"beside": 0.08, "afar": 1.5}       # where a record with parallax is as
 FEW, SAMPLES = 1 << 18, 1 << 14     # samples of a record around at most 10 distinct particles, and of others; half with parallax
 MESH = 1 << 14                      # points of the quadrature, for each record
 PROBES = 1 << 10                    # directions of a record that are looked at one by one
+ROTATED = 2.0**-22                  # by how much their lengths are off at most, as of directions that were rotated to a frame
 SPECIAL = [(0, 0, 1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, -1), (0.6, 0, 0.8), (0, 0.6, 0.8), (0.8, 0, -0.6),
            (0.5, 0.5, 0.5**0.5), (-0.5, 0.5, 0.5**0.5), (1, 0, 1e-7), (1, 0, -1e-7), (0, 1, 1e-4), (-1, -1, 1e-4)]
 
@@ -127,14 +128,15 @@ class Population:
 
     @functools.cached_property
     def probes(self) -> Directions:
-        """All over the sphere, close to the particles, below the horizon, and on the seams of maps."""
+        """All over the sphere, close to the particles, below the horizon, and on the seams of maps; z may be 1 + 2^-22."""
         rng, directions = self.rng(4), []
         for r in range(len(self)):
             around = self.proposals.around(r)
             near = around + 10 ** rng.uniform(-6, -1, (len(around), 1)) * rng.normal(size=around.shape)
             rest = uniform_directions(PROBES - len(SPECIAL) - len(near), rng)
             rest[rng.random(len(rest)) < 0.5, 2] *= -1
-            directions.append(normalised(np.concatenate([SPECIAL, near, rest])))
+            length = 1 + ROTATED * rng.integers(-1, 2, (PROBES, 1))
+            directions.append(np.float32(length) * normalised(np.concatenate([SPECIAL, near, rest])))
         n = len(self) * PROBES
         return Directions(np.repeat(np.arange(len(self)), PROBES), np.concatenate(directions), np.zeros(n))
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -14,7 +15,7 @@ from olpm_bench.check.density import ROUNDING, direction
 from olpm_bench.check.particles import vector
 from olpm_bench.check.picture import of_record
 from olpm_bench.check.trained import CORNERS, Trained, as_numpy
-from olpm_bench.check.verdict import Failure, PValues, Verdict, exact
+from olpm_bench.check.verdict import Failure, PValues, Verdict, exact, worst_of
 from representations.square import from_hemisphere, to_hemisphere
 
 BINS = 16                   # along each side of the square in the chi-square test
@@ -129,11 +130,15 @@ def _centre(index: int) -> np.ndarray:
     return np.array(wo).ravel()
 
 
-def mind_active(trained: Trained, n: int = 4096) -> Verdict:
+def mind_active(several: Sequence[Trained]) -> Verdict:
     """Lanes that are switched off may ask for records that don't exist: nothing is read there, and other lanes don't notice.
 
     Such a read may return anything or end the process; `JitFlag.Debug` makes it 0, and a line on sys.stderr.
     """
+    return worst_of({"" if trained.records.at is None else "with parallax": _mind_active(trained) for trained in several})
+
+
+def _mind_active(trained: Trained, n: int = 4096) -> Verdict:
     rng, records, r = trained.records.rng(7), trained.records, trained.representation
     chosen, on = rng.integers(0, len(records), n), rng.random(n) < 0.5
     active, record = mi.Bool(on), mi.UInt32(chosen.astype(np.uint32))

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import representations
-from olpm_bench.check import density, kernel, learning, many_records, memory, purity, samples, unbiased
+from olpm_bench.check import aiming, density, kernel, learning, many_records, memory, purity, samples, unbiased
 from olpm_bench.check.population import population, population_with_parallax
 from olpm_bench.check.trained import Trained
 from olpm_bench.check.verdict import Verdict, combined, sidak
@@ -85,7 +85,8 @@ CHECKS = (
     Check("samples", "samples follow the pdf", lambda s, level: samples.follow_pdf(s.trained, level), statistical=True),
     Check("one-particle", "around a single particle, samples follow the pdf",
           lambda s, level: kernel.keep_balance(s.representation, s.seed, level), statistical=True),
-    Check("inactive-lanes", "lanes that are switched off read and change nothing", lambda s, _: samples.mind_active(s.trained)),
+    Check("inactive-lanes", "lanes that are switched off read and change nothing",
+          lambda s, _: samples.mind_active((s.trained, s.aimed))),
     Check("parallax-density", "as density, asked from beside the record", lambda s, _: density.is_valid(s.aimed)),
     Check("parallax-integral", "as integral, asked from beside the record",
           lambda s, level: density.integral(s.aimed, level), statistical=True),
@@ -103,7 +104,10 @@ CHECKS = (
           lambda s, _: purity.take_new_records(s.trials)),
     Check("learning", "held-out directions become more likely with particles",
           lambda s, level: learning.learn(s.representation, s.seed, "constant" in s.declared, level), statistical=True),
-    Check("memory", "bytes a record don't grow with particles", lambda s, _: memory.stay_bounded(s.trials)),
+    Check("aiming", "aims at light nearby from where it is asked, if it minds that",
+          lambda s, _: aiming.aim(s.representation, s.seed)),
+    Check("memory", "bytes a record don't grow with particles",
+          lambda s, _: memory.stay_bounded(s.trials, (s.trained, s.aimed))),
     Check("furnace", "guided, a closed box keeps its radiance",
           lambda s, level: unbiased.keep_the_furnace(s.specification, s.seed, level), statistical=True),
     Check("image", "guided, an image keeps its expectation",

@@ -31,7 +31,7 @@ def p_values(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float]]:
     monkeypatch.setattr(samples, "ROUNDING", 0.0)
     monkeypatch.setattr(population, "FEW", 1 << 13)
     monkeypatch.setattr(population, "SAMPLES", 1 << 13)
-    monkeypatch.setattr(many_records, "RECORDS", 1 << 12)
+    monkeypatch.setattr(many_records, "RECORDS", 1 << 14)
     return found
 
 
@@ -65,7 +65,7 @@ def test_bins_at_the_rim_of_a_lobe_raise_no_alarm(p_values) -> None:
 
 
 def test_two_percent_are_found_in_few_samples(p_values) -> None:
-    """Of 16,384 samples by their sum, and no bin shows it; of 65,536 in many records."""
+    """Of 16,384 samples by their sum, and no bin shows it; of some 70,000 in many records."""
     samples.follow_pdf(Trained(mutants.UntrainedTwoPercent(), small_population(0)), 0.01)
     assert p_values["sum"][0] < 1e-9 and min(p_values["bins"]) > 1e-3
     many_records.are_right(mutants.UntrainedTwoPercent(), 0, 0.01)

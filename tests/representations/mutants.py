@@ -5,6 +5,7 @@ Also from the command line: ``olpm-bench check tests/representations/mutants.py:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -17,7 +18,8 @@ from representations.gaussian_mixture import GaussianMixture
 from representations.hey import HeyCones
 from representations.interface import ParticleBatch
 from representations.jensen import JensenHistogram, JensenState
-from representations.square import to_hemisphere
+from representations.parallax import aim
+from representations.square import TO_SOLID_ANGLE, to_hemisphere
 from representations.state import join
 
 # ---------------------------------------------------------------------------------------------- densities
@@ -121,6 +123,29 @@ class NegativeAtTheRim(JensenHistogram):
     def _density(self, state, record, wo, total, active):
         pdf = super()._density(state, record, wo, total, active)
         return dr.select((wo.z > 0) & (wo.z < 1e-3) & (pdf == 0), -1e-7, pdf)
+
+
+class AboveOne(JensenHistogram):
+    """NaN where rounding has brought z above 1."""
+    def _density(self, state, record, wo, total, active):
+        pdf = super()._density(state, record, wo, total, active)
+        return dr.select(dr.isnan(dr.acos(wo.z)), dr.nan, pdf)
+
+
+class UntrainedNaN(JensenHistogram):
+    """NaN in one record in 10,000, as long as it has learnt nothing."""
+    def _density(self, state, record, wo, total, active):
+        pdf = super()._density(state, record, wo, total, active)
+        return dr.select((record % 10_000 == 9_999) & (total <= 0), dr.nan, pdf)
+
+
+class FloatIndex(JensenHistogram):
+    """pdf() counts bins in float32, which is exact up to 2^24: to the 65,536th record."""
+    def _density(self, state, record, wo, total, active):
+        above = active & (wo.z > 0)
+        i = mi.UInt32(dr.fma(mi.Float(record), float(self.bins), mi.Float(self._bin(wo))))
+        mass = dr.gather(mi.Float, state.mass, dr.minimum(i, dr.opaque(mi.UInt32, len(state.mass) - 1)), above)
+        return dr.select(total > 0, mass / total * (self.bins * TO_SOLID_ANGLE), cosine_pdf(wo))
 
 
 # ---------------------------------------------------------------------------------------------- samples
@@ -262,6 +287,29 @@ class ParallaxNotReported(HeyCones):
     def sample(self, state, record, sample1, sample2, active=True, at=None):
         wo, _ = super().sample(state, record, sample1, sample2, active, at)
         return wo, super().pdf(state, record, wo, active)
+
+
+class NaNAtTheRecord(HeyCones):
+    """Normalises the vector to the point from which it is asked, which may be 0."""
+    def _density(self, state, record, wo, total, active, at):
+        pdf = super()._density(state, record, wo, total, active, at)
+        return pdf if at is None else dr.select(dr.isnan(dr.normalize(at).z), dr.nan, pdf)
+
+
+class ParallaxActiveForgotten(HeyCones):
+    """Reads distances in lanes that are switched off."""
+    def _cone(self, state, i, active, at):
+        cone = dr.gather(mi.Vector4f, state.cone, i, active)
+        if at is not None and len(state.near):
+            x, y, z, _ = aim((cone.x, cone.y, cone.z), dr.gather(mi.Float, state.near, i), at)
+            cone = mi.Vector4f(x, y, z, cone.w)
+        return cone
+
+
+class ParallaxWrongWay(GaussianMixture):
+    """Aims from the record's other side, in sample() and pdf() alike."""
+    def _lobes(self, state, record, active, at):
+        return super()._lobes(state, record, active, None if at is None else -at)
 
 
 # ---------------------------------------------------------------------------------------------- images
@@ -480,6 +528,116 @@ class ParallaxMirrored(GaussianMixture):
         return super().update(state, batch, seed)
 
 
+class LandingsIgnored(GaussianMixture):
+    """Learns directions as if they had been seen from the record."""
+    def update(self, state, batch, seed=0):
+        return super().update(state, replace(batch, at=None), seed)
+
+
+class CosineTwice(JensenHistogram):
+    """Weights times the cosine, which they contain already."""
+    def update(self, state, batch, seed=0):
+        return super().update(state, replace(batch, weight=batch.weight * batch.wo.z), seed) if len(batch) else state
+
+
+class SquaresOverflow(JensenHistogram):
+    """Divides by the sum of squared weights, which float32 can't hold for all."""
+    def update(self, state, batch, seed=0):
+        if len(batch) == 0:
+            return state
+        squares = dr.gather(mi.Float, replace(batch, weight=dr.square(batch.weight)).sums(), batch.record)
+        return super().update(state, replace(batch, weight=dr.select(squares > 0, batch.weight, 0)), seed)
+
+
+class ForgetsAll(JensenHistogram):
+    """Halves what all records know with each batch, until nothing is left of those that learn no more."""
+    def update(self, state, batch, seed=0):
+        return super().update(JensenState(state.mass / 2, state.cumulative / 2), batch, seed) if len(batch) else state
+
+
+class SeedIgnored(GaussianMixture):
+    """Always draws the same particles."""
+    def init(self, n_records, seed=0, parallax=False):
+        return super().init(n_records, 0, parallax)
+
+    def update(self, state, batch, seed=0):
+        return super().update(state, batch, 0)
+
+
+class StaleRemainder(JensenHistogram):
+    """Updates the sums that it samples from in chunks of 1,024 records, and leaves out the last, after the first time."""
+    def update(self, state, batch, seed=0):
+        new = super().update(state, batch, seed)
+        record = dr.arange(mi.UInt32, len(new.mass)) // self.bins
+        chunks = dr.opaque(mi.UInt32, batch.n_records // 1024 * 1024)
+        fresh = dr.gather(mi.Float, state.cumulative, record * self.bins + self.bins - 1) == 0
+        return replace(new, cumulative=dr.select(fresh | (record < chunks) | (chunks == 0), new.cumulative, state.cumulative))
+
+
+class RemainderLost(JensenHistogram):
+    """Learns in chunks of 1,024 records, and leaves out the last."""
+    def update(self, state, batch, seed=0):
+        new = super().update(state, batch, seed)
+        learnt = dr.arange(mi.UInt32, len(new.mass)) // self.bins < dr.opaque(mi.UInt32, max(1, batch.n_records // 1024) * 1024)
+        return JensenState(dr.select(learnt, new.mass, state.mass), dr.select(learnt, new.cumulative, state.cumulative))
+
+
+@dataclass
+class Visited(JensenState):
+    seen: Any               # particles of each record
+
+
+class RarelyRebuilt(JensenHistogram):
+    """Updates the sums that it samples from only for a hundredth of new particles."""
+    def init(self, n_records, seed=0, parallax=False):
+        return Visited(**vars(super().init(n_records, seed, parallax)), seen=dr.zeros(mi.UInt32, n_records))
+
+    def update(self, state, batch, seed=0):
+        new, seen = super().update(JensenState(state.mass, state.cumulative), batch, seed), state.seen + batch.count()
+        many = dr.gather(mi.Bool, batch.count() * 100 >= seen, dr.arange(mi.UInt32, len(new.mass)) // self.bins)
+        return Visited(new.mass, dr.select(many, new.cumulative, state.cumulative), seen)
+
+
+@dataclass
+class Pointed(JensenState):
+    first: Any              # where the masses of each record begin, once it has any
+
+
+class Pointers(JensenHistogram):
+    """Finds masses by an index into the whole array: those of the original, in a copy."""
+    def init(self, n_records, seed=0, parallax=False):
+        return Pointed(**vars(super().init(n_records, seed, parallax)), first=dr.zeros(mi.UInt32, n_records))
+
+    def update(self, state, batch, seed=0):
+        new = super().update(JensenState(state.mass, state.cumulative), batch, seed)
+        fresh = (state.first == 0) & (batch.count() > 0)
+        return Pointed(new.mass, new.cumulative, dr.select(fresh, dr.arange(mi.UInt32, batch.n_records) * self.bins, state.first))
+
+    def _density(self, state, record, wo, total, active):
+        above = active & (wo.z > 0)
+        mass = dr.gather(mi.Float, state.mass, dr.gather(mi.UInt32, state.first, record, above) + self._bin(wo), above)
+        return dr.select(total > 0, mass / total * (self.bins * TO_SOLID_ANGLE), cosine_pdf(wo))
+
+
+@dataclass
+class Diary(JensenState):
+    pages: Any              # a number for each batch, in room that doubles
+
+
+class GrowsWithBatches(JensenHistogram):
+    """Keeps a number for each batch."""
+    def init(self, n_records, seed=0, parallax=False):
+        return Diary(**vars(super().init(n_records, seed, parallax)), pages=dr.zeros(mi.Float, 8 * n_records))
+
+    def update(self, state, batch, seed=0):
+        new = super().update(JensenState(state.mass, state.cumulative), batch, seed)
+        pages = state.pages.numpy().reshape(max(batch.n_records, 1), -1)
+        used = int(pages.any(0).sum())
+        pages = np.pad(pages, ((0, 0), (0, pages.shape[1] * (used == pages.shape[1]))))
+        pages[:, used:used + 1] = 1
+        return Diary(new.mass, new.cumulative, mi.Float(pages.ravel()))
+
+
 @dataclass
 class Hoard(JensenState):
     kept: Any               # weights of all particles, of all batches
@@ -493,6 +651,35 @@ class MemoryGrows(JensenHistogram):
     def update(self, state, batch, seed=0):
         known = super().update(JensenState(state.mass, state.cumulative), batch, seed)
         return Hoard(**vars(known), kept=join(state.kept, batch.weight))
+
+
+BATCHES: list[Any] = []
+RECORDS: dict[Any, Any] = {}
+
+
+class KeepsGlobally(JensenHistogram):
+    """Keeps all batches in a variable of its module."""
+    def update(self, state, batch, seed=0):
+        BATCHES.append(batch)
+        return super().update(state, batch, seed)
+
+
+class KeepsInABox(JensenHistogram):
+    """Keeps all batches in another object."""
+    def __init__(self, resolution=16):
+        super().__init__(resolution)
+        self.box = SimpleNamespace(batches=[])
+
+    def update(self, state, batch, seed=0):
+        self.box.batches.append(batch)
+        return super().update(state, batch, seed)
+
+
+class RecordsRemembered(JensenHistogram):
+    """Takes the particles of a batch for those of the records of an earlier one of that shape."""
+    def update(self, state, batch, seed=0):
+        record = RECORDS.setdefault((len(batch), batch.n_records), batch.record)
+        return super().update(state, replace(batch, record=record), seed)
 
 
 class FailsToRun(CosineLobe):
@@ -525,5 +712,10 @@ CAUGHT_BY = {
     WeightsIgnored: "learning", MemoryGrows: "memory", FailsToRun: "density",
     LateInflation: "integral", Drift: "integral", LateNaN: "density", SecondNaN: "many-records", ParallaxNaN: "many-records",
     NoPlaceAsked: "many-records", UnseededWhenFull: "purity", KeepsBatches: "purity",
+    AboveOne: "density", UntrainedNaN: "many-records", FloatIndex: "many-records", NaNAtTheRecord: "many-records",
+    StaleRemainder: "many-records", RemainderLost: "many-records", RarelyRebuilt: "samples", Pointers: "new-records",
+    ParallaxActiveForgotten: "inactive-lanes", ParallaxWrongWay: "aiming", LandingsIgnored: "aiming", CosineTwice: "learning",
+    SquaresOverflow: "scale", ForgetsAll: "nothing-new", SeedIgnored: "independence", GrowsWithBatches: "memory",
+    KeepsGlobally: "purity", KeepsInABox: "purity", RecordsRemembered: "independence",
     RootsOfWeights: "learning", ParallaxMirrored: "learning", EndsTheProcess: "density",
 }
