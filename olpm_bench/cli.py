@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
+from olpm_bench.bench.terminal import one_line
 from olpm_bench.transport.settings import InputError
 from representations import RepresentationError
 from representations._llvm import LLVMError
@@ -22,7 +23,6 @@ from representations._llvm import LLVMError
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 ENDING = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]      # as Ctrl-C
 RESUMED = ("run", "submit", "gate", "reference")
-LONGEST = 1000              # characters of a complaint
 MAX_SEED = 2**15 - 1        # of cells: `config.MAX_SEED`, whose import would take a second of every --help
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
@@ -43,12 +43,6 @@ Assignments = Annotated[list[str], typer.Option(
 def complain(message: str) -> None:
     """One line on stderr."""
     print(f"olpm-bench: {one_line(' '.join(message.split()))}", file=sys.stderr)
-
-
-def one_line(text: str) -> str:
-    """What came from a file can neither steer the terminal nor fill it."""
-    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-    return line if len(line) <= LONGEST else f"{line[:LONGEST // 2]} ... {line[-LONGEST // 2:]}"
 
 
 def command(body: Callable[..., None]) -> Callable[..., None]:

@@ -29,6 +29,7 @@ from olpm_bench.bench.files import SCHEMA_VERSION, slug
 from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes
 
+LEAST_SECONDS = 1e-3        # of a budget: a pass takes longer
 MAX_SEED = 2**15 - 1        # seeds of passes, cells and references share 32 bits, see cell.pass_seed
 NO_REFERENCE = Path("none")
 LOOKS = 8                   # methods that the figures' style tells apart
@@ -56,7 +57,7 @@ class Budget(Table):
 
     checkpoints: images kept on the way, at log-spaced times (or sample counts); the last is the final image.
     """
-    seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
+    seconds: float | None = Field(None, ge=LEAST_SECONDS, allow_inf_nan=False)
     spp: int | None = Field(None, ge=1, le=2**31)
     checkpoints: int = Field(8, ge=1, le=64)
 

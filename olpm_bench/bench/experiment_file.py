@@ -22,6 +22,7 @@ from olpm_bench import scenes as embedded
 from olpm_bench.bench.config import NO_REFERENCE, Budget, Claim, ConfigError, Experiment, Method, Scene, SweepFigure
 from olpm_bench.bench.scale import scaled
 from olpm_bench.bench.sweep import expanded
+from olpm_bench.bench.terminal import one_line
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, preset_of
 
 TABLES = {"budget": Budget, "scene": Scene, "method": Method, "claim": Claim, "sweep": SweepFigure,
@@ -109,7 +110,7 @@ def announce(representation: str | None) -> None:
     """Say on the terminal, once, that code is run which is not ours: that of FILE.py:Class."""
     found = representations.file_of(representation or "")
     if found is not None and found[0].is_file():
-        print(f"olpm-bench: runs the code of {found[0]}", file=sys.stderr)
+        print(one_line(f"olpm-bench: runs the code of {found[0]}"), file=sys.stderr)
 
 
 def _without_paths(data: dict[str, Any], folder: Path, source: str) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from olpm_bench.transport.settings import InputError
 
+MOST = 1000                 # values of a sweep
 TABLES = ("training", "integrator", "representation")
 
 
@@ -33,6 +34,8 @@ def expanded(method: dict[str, Any]) -> list[dict[str, Any]]:
         raise InputError(f"{where}: {setting!r}: must be TABLE.KEY with one of the tables {', '.join(TABLES)}")
     if not isinstance(values, list) or not values or not all(map(_is_positive, values)) or len(set(values)) < len(values):
         raise InputError(f"{where}: {setting} = {values!r}: must be different positive numbers")
+    if len(values) > MOST:
+        raise InputError(f"{where}: {setting} has {len(values)} values; must be at most {MOST}")
     if not isinstance(method.get(table, {}), dict):
         raise InputError(f"{where}: {table} = {method[table]!r}: must be a table")
     rest = {k: v for k, v in method.items() if k != "sweep"}

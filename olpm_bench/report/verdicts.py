@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench.summary import print_whole
+from olpm_bench.bench.terminal import one_line
 from olpm_bench.report import figures
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def print_table(outcomes: Sequence[Outcome], pictures: dict[str, str], console: 
 
 
 def line(console: Console, text: str, style: str = "") -> None:
-    console.print(text, style=style or None, markup=False, highlight=False, soft_wrap=True)
+    console.print(one_line(text), style=style or None, markup=False, highlight=False, soft_wrap=True)
 
 
 def statistic(v: Verdict) -> str:

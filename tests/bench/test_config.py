@@ -147,6 +147,7 @@ def test_some_scenes_of_an_experiment(tmp_path):
     ("spp = 8", "", ["[budget]", "give one of seconds and spp"]),
     ("spp = 8", "spp = -8", ["[budget]: spp", "-8", "greater than or equal to 1"]),
     ("spp = 8", "seconds = nan", ["[budget]: seconds"]),
+    ("spp = 8", "seconds = 1e-300", ["[budget]: seconds", "0.001"]),
     ("spp = 8", "spp = 8.5", ["[budget]: spp", "8.5"]),
     ("width = 16", 'width = "16"', ["[[scene]] 1: width", "'16'", "integer"]),
     ("width = 16", "", ["missing key 'width'", "[[scene]] 1"]),

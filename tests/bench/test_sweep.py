@@ -89,6 +89,7 @@ def test_values_are_short(value, text):
     ('{ photons = [1, 2] }', "'photons': must be TABLE.KEY"),
     ('{ "training.photon" = [1, 2] }', "unknown key 'photon'; known: schedule"),
     ('{ "training.photons" = [1.5] }', "photons = 1.5: must be"),
+    (f'{{ "training.photons" = {list(range(1, 1002))} }}', "training.photons has 1001 values; must be at most 1000"),
 ])
 def test_mistakes_are_one_line(tmp_path, new, words):
     with pytest.raises(ConfigError) as error:

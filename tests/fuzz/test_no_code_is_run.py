@@ -90,6 +90,14 @@ def test_reading_runs_nothing_but_what_is_announced(tmp_path):
     assert said.count(f"olpm-bench: runs the code of {tmp_path / 'mine.py'}") == 1
 
 
+def test_a_file_cannot_hide_by_its_name_that_it_is_run(tmp_path):
+    (tmp_path / "mine\x1b[2K\r\x1b[1A.py").write_text("class Mine:\n    pass\n")
+    file = tmp_path / "experiment.toml"
+    experiment(tmp_path, "mine\x1b[2K\r\x1b[1A.py:Mine").rename(file)
+    seen, said = watched(tmp_path, file)
+    assert seen and f"olpm-bench: runs the code of {tmp_path}/mine\\x1b[2K\\r\\x1b[1A.py" in said and "\x1b" not in said
+
+
 @pytest.fixture
 def library(tmp_path) -> Path:
     """plugins/evil.so, which makes a file RAN when it is loaded."""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import others
 import pytest
 
 from olpm_bench import scenes
@@ -14,7 +15,6 @@ from olpm_bench.scenes import SceneError
 from olpm_bench.scenes.geometry import turn_z
 from olpm_bench.scenes.load import load
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 BITTERLI = ["classroom", "dining-room", "living-room", "staircase2", "veach-ajar", "veach-bidir"]
 
 SENSOR = """<sensor type="perspective"><float name="fov" value="40"/>
@@ -103,10 +103,7 @@ def test_includes_inside_each_other(tmp_path: Path):
 @pytest.mark.parametrize("name", BITTERLI)
 @pytest.mark.filterwarnings("ignore:.*only absorbs")
 def test_shared_scenes(name: str):
-    file = SHARED / name / "scene.xml"
-    if not file.exists():
-        pytest.skip(f"{file} is not there")
-    scene = load(file, None, 96, 54)
+    scene = load(others.folder_of(name) / "scene.xml", None, 96, 54)
     film = scene.sensors()[0].film()
     assert list(film.size()) == [96, 54]
     assert film.rfilter().class_name() == "BoxFilter"

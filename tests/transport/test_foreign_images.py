@@ -7,17 +7,15 @@ images' noise: we expect means within 2 %, half of the blocks of pixels within 3
 """
 from __future__ import annotations
 
-from pathlib import Path
-
 import mitsuba as mi
 import numpy as np
+import others
 import pytest
 from small_scenes import assert_same_expectation, blocks, passes
 
 import olpm_bench
 from olpm_bench.scenes.load import load
 
-SHARED = Path(__file__).parents[3] / "shared" / "scenes"
 SCENES = {"veach-ajar": (9, 16, 13), "veach-bidir": (8, 8, 7)}   # rows and columns of blocks; depth, that of the scene's file
 BLOCK = 5                   # pixels along each side
 PASSES, SPP = 32, 32
@@ -28,9 +26,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("name", SCENES)
 def test_unguided_guided_and_foreign_images_agree(name: str):
-    folder, (rows, columns, depth) = SHARED / name, SCENES[name]
-    if not folder.exists():
-        pytest.skip(f"needs {folder}")
+    folder, (rows, columns, depth) = others.folder_of(name), SCENES[name]
     scene = load(folder / "scene.xml", width=BLOCK * columns, height=BLOCK * rows, max_depth=depth)
     guide = olpm_bench.train(scene, "gaussian_mixture", max_depth=depth, **TRAINING)
     unguided = passes(scene, scene.integrator(), PASSES, SPP, seed=1000)

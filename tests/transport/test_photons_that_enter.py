@@ -6,11 +6,11 @@ A photon is of use if it leaves a hit on a surface that the camera sees: in a vo
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import others
 import pytest
 
 from olpm_bench.scenes.load import load
@@ -20,7 +20,6 @@ from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import LANES, emit_importons, emit_photons, trace
 from olpm_bench.transport.training import PassStatistics, Training
 
-SHARED = Path(__file__).parents[3] / "shared" / "scenes"
 SCENES = {"dining-room": 15, "classroom": 100}          # times as many photons of use as by the emitters' own samplers
 RAYS, EDGE = 200_000, 0.005                             # of the camera; of the voxels, in units of the scene's diagonal
 LEARNT = 40                                             # particles of a record
@@ -77,9 +76,7 @@ def learnt_later(training: Training) -> float:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_more_photons_are_of_use(name: str):
-    if not (SHARED / name).exists():
-        pytest.skip(f"needs {SHARED / name}")
-    scene, share, learnt = load(SHARED / name / "scene.xml", width=96, height=54, max_depth=13), {}, {}
+    scene, share, learnt = load(others.folder_of(name) / "scene.xml", width=96, height=54, max_depth=13), {}, {}
     for emission in ("emitter", "guided"):
         few = settings.training(**PARTICLES, emission=emission)
         training = Training(scene, "gaussian_mixture", few, settings.integrator(max_depth=13))
