@@ -43,8 +43,18 @@ name = "GMM"
 representation = { type = "gaussian_mixture" }
 """
 OTHERS = """
+[[scene]]
+name = "classroom"
+parameters = { sky = 0.5 }
+width = 16
+height = 12
+reference = "none"
 [[method]]
 name = "Path tracing"
+[[method]]
+name = "GMM, while rendering"
+representation = { type = "gaussian_mixture" }
+training = { while_rendering = true, emission = "guided" }
 [[method]]
 name = "GMM, paper2014"
 representation = { type = "gaussian_mixture" }

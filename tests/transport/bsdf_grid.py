@@ -1,7 +1,10 @@
 """A room full of spheres, each with another BSDF and its own block of pixels, under any of Mitsuba's emitters."""
 from __future__ import annotations
 
+import functools
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -11,6 +14,7 @@ from olpm_bench.check.small_scenes import grey, wall
 
 COLUMNS, CELL = 6, 6        # spheres in a row; pixels along each side of the block that shows one
 PITCH, RADIUS = 0.4, 0.17   # of the spheres, in scene units
+_FILES = tempfile.TemporaryDirectory()
 
 
 def _texture(seed: int = 3, mean: float = 0.5, spread: float = 0.3, **properties: Any) -> dict[str, Any]:
@@ -28,8 +32,24 @@ def _bumps() -> dict[str, Any]:
     return _texture(seed=6, to_uv=mi.ScalarTransform4f().scale(2))
 
 
-# All BSDFs of Mitsuba 3.9.1 but those that need a file of measurements (measured, measured_polarized) and those that only change
-# polarisation (polarizer, retarder, circular).
+@functools.cache
+def _measurements() -> str:
+    """A file of what nobody has measured: random reflectance, of random half vectors."""
+    rng, path = np.random.default_rng(9), Path(_FILES.name) / "measured.bsdf"
+
+    def table(*shape: int) -> np.ndarray:
+        return rng.uniform(0.5, 1.5, shape).astype(np.float32)
+
+    elevations, size = np.linspace(0, np.pi / 2, 8, dtype=np.float32), (8, 8)
+    angles, u = (1, len(elevations)), np.linspace(0, 1, 64, dtype=np.float32)       # u^2 pi / 2: elevation of the half vector
+    mi.tensor_io.write(str(path), description=np.frombuffer(b"random", np.uint8), jacobian=np.zeros(1, np.uint8),
+                       theta_i=elevations, phi_i=np.zeros(1, np.float32), ndf=table(*size), sigma=table(*size),
+                       vndf=u**3 * table(*angles, 8, len(u)), luminance=table(*angles, *size),
+                       rgb=0.08 * table(*angles, 3, *size))
+    return str(path)
+
+
+# All BSDFs of Mitsuba 3.9.1 but those that only mind polarisation (measured_polarized, polarizer, retarder, circular).
 BSDFS = {
     "diffuse": lambda: {"type": "diffuse", "reflectance": _texture()},
     "conductor": lambda: {"type": "conductor", "material": "Cu"},
@@ -56,6 +76,7 @@ BSDFS = {
                                     "b": {"type": "roughplastic"}},
     "twosided": lambda: _two_sided({"type": "roughplastic"}, grey(0.5)),
     "bumpmap": lambda: {"type": "bumpmap", "scale": 0.05, "bump": _bumps(), "bsdf": {"type": "roughplastic", "alpha": 0.2}},
+    "measured": lambda: {"type": "measured", "filename": _measurements()},
     "normalmap": lambda: {"type": "normalmap", "normalmap": _normals(), "bsdf": {"type": "roughconductor", "alpha": 0.3}},
 }
 
@@ -94,7 +115,7 @@ EMITTERS = {
 }
 
 
-def scene(emitters: Sequence[str], bsdfs: Sequence[str] = tuple(BSDFS)) -> mi.Scene:
+def scene(emitters: Sequence[str], bsdfs: Sequence[str]) -> mi.Scene:
     """An open box, spheres of these BSDFs before its back wall, and a camera that sees a sphere in each block of `CELL` x `CELL`
     pixels.
     """

@@ -20,7 +20,7 @@ LEVEL = sidak(0.01, len(BSDFS) * len(ANGLES))
 # Those of Mitsuba 3.9.1 whose densities are not realised where the BSDF has no value: below the horizon or on the dark side pdf()
 # is not 0, or samples of weight 0 report a density.  No image depends on it.
 STRAY = {"diffuse", "roughconductor", "roughconductor, all normals", "roughdielectric", "roughdielectric, ggx", "roughplastic",
-         "principled, transmissive", "principledthin", "blendbsdf", "blendbsdf, textured", "twosided", "bumpmap"}
+         "principled, transmissive", "principledthin", "blendbsdf", "blendbsdf, textured", "twosided", "bumpmap", "measured"}
 
 pytestmark = pytest.mark.slow
 
