@@ -38,11 +38,15 @@ def print_table(outcomes: Sequence[Outcome], pictures: dict[str, str], console: 
         table.add_row(o.check.name, mark, Text(statistic(o.verdict)), f"{o.seconds:.1f}", Text(o.check.sentence))
     console = console or Console()
     print_whole(table, console)
+    failed: dict[str, list[str]] = {}           # one error may fail many checks
     for o in outcomes:
         if not o.verdict.passed:
-            line(console, f"{o.check.name} FAILED: {o.verdict.worst}", "bold red")
-            if o.check.name in pictures:
-                line(console, f"  picture: {pictures[o.check.name]}")
+            failed.setdefault(o.verdict.worst, []).append(o.check.name)
+    for words, names in failed.items():
+        line(console, f"{', '.join(names)} FAILED: {words}", "bold red")
+        for name in names:
+            if name in pictures:
+                line(console, f"  picture: {pictures[name]}")
     for o in outcomes:
         if o.verdict.note:
             line(console, f"{o.check.name}: {o.verdict.note}")

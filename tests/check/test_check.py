@@ -244,6 +244,12 @@ def test_bad_input(arguments: list[str], words: str) -> None:
     assert result.exit_code == 2 and words in result.stderr and len(result.stderr.splitlines()) == 1
 
 
+def test_an_error_that_fails_several_checks_is_told_once() -> None:
+    result = call(f"{MUTANTS}:FailsToRun", "--only", "density", "--only", "integral")
+    assert result.exit_code == 1 and result.stdout.count("AttributeError") == 1
+    assert "density, integral FAILED: AttributeError" in result.stdout
+
+
 def test_errors_of_other_peoples_code_are_failures() -> None:
     outcome, = suite.run(suite.Subject({"type": f"{MUTANTS}:FailsToRun"}), suite.named(["purity"]))
     assert not outcome.verdict.passed and outcome.verdict.worst.startswith("AttributeError: ")
