@@ -12,6 +12,7 @@ from olpm_bench.bench.exr import read_exr
 from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.reference_file import read_reference
 from olpm_bench.bench.summary import number, print_whole
+from olpm_bench.bench.terminal import plain_console
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -66,7 +67,6 @@ def _read(path: Path) -> np.ndarray:
 
 def print_comparison(found: Comparison, console: Console | None = None) -> None:
     """Print a line for each metric; the smaller of two errors is marked."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -77,7 +77,7 @@ def print_comparison(found: Comparison, console: Console | None = None) -> None:
     for name, errors in found.errors.items():
         best = min(errors) if len(errors) > 1 else None
         table.add_row(name, *(Text(number(e), style="bold green" if e == best else "") for e in errors))
-    console = console or Console()
+    console = console or plain_console()
     print_whole(table, console)
     console.print(f"against {found.reference}", markup=False, highlight=False, soft_wrap=True)
     for path, invalid in zip(found.images, found.invalid_pixels, strict=True):

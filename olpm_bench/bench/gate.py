@@ -18,6 +18,7 @@ from olpm_bench.bench.files import SCHEMA_VERSION
 from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Cell, Results
 from olpm_bench.bench.summary import APART, apart, complete_cells, number, print_whole, work
+from olpm_bench.bench.terminal import plain_console
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -110,7 +111,6 @@ def write(verdicts: list[Verdict], results: Results) -> None:
 
 def print_verdicts(verdicts: list[Verdict], console: Console | None = None) -> None:
     """Print a line for each claim and scene."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -122,4 +122,4 @@ def print_verdicts(verdicts: list[Verdict], console: Console | None = None) -> N
         bounds = f"{number(v.low)}-{number(v.high)} ({v.claim.confidence:.3g} each)"
         table.add_row(Text(v.scene), Text(claim), number(v.ratio), bounds,
                       Text(str(v), style="green" if v.holds else "bold red"))
-    print_whole(table, console or Console())
+    print_whole(table, console or plain_console())

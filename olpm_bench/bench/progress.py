@@ -7,8 +7,9 @@ from __future__ import annotations
 import sys
 import time
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from olpm_bench.bench.terminal import plain_console
 
 QUIET_SECONDS = 30.0        # between lines where there is no terminal
 
@@ -39,7 +40,7 @@ class Bar:
 
     def __init__(self, total: float) -> None:
         self.total, self.done, self.label = max(total, 1e-9), 0.0, ""
-        self.console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self.console = plain_console(stderr=True)
         self.progress: Progress | None = None
         self.drawn = time.monotonic()
 
@@ -68,4 +69,4 @@ class Bar:
 
     def say(self, line: str) -> None:
         """A line that stays."""
-        self.console.print(line, markup=False)
+        self.console.print(line, soft_wrap=True)

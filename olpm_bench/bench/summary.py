@@ -17,6 +17,7 @@ from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
 from olpm_bench.bench.reference_file import NEAR_FLOOR
 from olpm_bench.bench.results import Cell, Results, warnings
+from olpm_bench.bench.terminal import plain_console
 
 APART = 6.0                 # standard errors between the mean images of two methods, beyond which that is said
 LATE = 0.05                 # share of a budget in seconds by which a cell may exceed it, before that is said
@@ -154,7 +155,6 @@ def write(summary: dict[str, Any], results: Results) -> None:
 
 def print_table(summary: dict[str, Any], console: Console | None = None) -> None:
     """Print the rows: errors with their spread over seeds, seconds, counts; flags cells that waited or went wrong."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -175,14 +175,13 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
                 number(row["relmse"]), number(row["relmse_trimmed"]), number(row["work_normalised_variance"]),
                 _gain(row), f"{row['training_passes']}",
                 f"{row['train_seconds']:.1f}", f"{row['render_seconds']:.1f}", f"{row['spp']}", f"{row['records']}")
-    console = console or Console()
+    console = console or plain_console()
     print_whole(table, console)
     _print_notes(summary, console)
 
 
 def print_metrics(summary: dict[str, Any], console: Console | None = None) -> None:
     """Print every metric of every row, and what is to be known of the cells."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -191,7 +190,7 @@ def print_metrics(summary: dict[str, Any], console: Console | None = None) -> No
         table.add_column(name, justify="left" if name in ("scene", "method") else "right", no_wrap=True)
     for row in summary["rows"]:
         table.add_row(Text(row["scene"]), Text(row["method"]), *(number(row[name]) for name in metrics.METRICS))
-    console = console or Console()
+    console = console or plain_console()
     print_whole(table, console)
     _print_notes(summary, console)
 
@@ -238,9 +237,8 @@ def _gain(row: Mapping[str, Any]) -> str:
 def print_speed_ups(found: Mapping[str, Mapping[str, statistics.Interval]], baseline: str,
                     console: Console | None = None) -> None:
     """Print `speed_up_lines`."""
-    from rich.console import Console
 
-    console = console or Console()
+    console = console or plain_console()
     for line in speed_up_lines(found, baseline):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench.summary import print_whole
-from olpm_bench.bench.terminal import one_line
+from olpm_bench.bench.terminal import one_line, plain_console
 from olpm_bench.report import figures
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ FARTHEST = 6.0                  # standard deviations from which on colours are 
 
 def print_table(outcomes: Sequence[Outcome], pictures: dict[str, str], console: Console | None = None) -> None:
     """A row for each check, and the worst case in words of those that fail."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -36,7 +35,7 @@ def print_table(outcomes: Sequence[Outcome], pictures: dict[str, str], console: 
     for o in outcomes:
         mark = Text("passed", style="green") if o.verdict.passed else Text("FAILED", style="bold red")
         table.add_row(o.check.name, mark, Text(statistic(o.verdict)), f"{o.seconds:.1f}", Text(o.check.sentence))
-    console = console or Console()
+    console = console or plain_console()
     print_whole(table, console)
     failed: dict[str, list[str]] = {}           # one error may fail many checks
     for o in outcomes:
@@ -53,7 +52,7 @@ def print_table(outcomes: Sequence[Outcome], pictures: dict[str, str], console: 
 
 
 def line(console: Console, text: str, style: str = "") -> None:
-    console.print(one_line(text), style=style or None, markup=False, highlight=False, soft_wrap=True)
+    console.print(one_line(text), style=style or None, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def statistic(v: Verdict) -> str:

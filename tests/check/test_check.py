@@ -262,4 +262,4 @@ def test_who_asks_for_too_much_memory_fails(tmp_path: Path) -> None:
                                         "        return super().update(state, batch, seed + len(np.zeros(1 << 50)))\n")
     result = call(f"{tmp_path}/greedy.py:Greedy", "--only", "scale", "--only", "purity", "--pictures", tmp_path)
     assert result.exit_code == 1 and "2 of 2 checks FAILED" in result.stdout
-    assert "scale FAILED: " in result.stdout and "MemoryError: Unable to allocate 8.00 PiB" in result.stdout
+    assert "scale, purity FAILED: " in result.stdout and "MemoryError: Unable to allocate 8.00 PiB" in result.stdout

@@ -34,7 +34,7 @@ def test_what_ends_the_process_fails_and_the_other_checks_go_on(tmp_path: Path, 
     only = [word for check in ("memory", "density", "samples") for word in ("--only", check)]
     result = CliRunner().invoke(app, ["check", f"{tmp_path / 'ends.py'}:{name}", *only, "--pictures", str(tmp_path)])
     assert result.exit_code == 1 and "2 of 3 checks FAILED" in result.stdout
-    assert f"density FAILED: ends the process: {end}" in result.stdout
+    assert f"density, samples FAILED: ends the process: {end}" in result.stdout and f"ends.py:{name}: 2 of 3" in result.stdout
     passed = [line.split()[0] for line in result.stdout.splitlines() if "passed" in line.split()]
     assert passed == ["memory"]
 
