@@ -47,7 +47,7 @@ def print_table(outcomes: Sequence[Outcome], pictures: dict[str, str], console: 
             if name in pictures:
                 line(console, f"  picture: {pictures[name]}")
     for o in outcomes:
-        if o.verdict.note:
+        if o.verdict.note not in ("", o.verdict.worst):
             line(console, f"{o.check.name}: {o.verdict.note}")
 
 
