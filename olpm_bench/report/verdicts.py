@@ -62,7 +62,7 @@ def statistic(v: Verdict) -> str:
     if v.p is not None:
         return f"smallest p of {v.tests}: {v.statistic:.2g} {'>=' if v.passed else '<'} {v.threshold:.2g}"
     if v.threshold == 0:
-        return f"{v.statistic:.0f} {v.measure}"
+        return f"{v.statistic:{'.0f' if float(v.statistic).is_integer() else '.3g'}} {v.measure}"
     return f"{v.measure}: {v.statistic:.3g}" + ("" if v.threshold is None else f" (bound {v.threshold:.3g})")
 
 
