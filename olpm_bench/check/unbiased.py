@@ -21,9 +21,12 @@ TRAINING: dict[str, Any] = {"passes": 2, "photons": 20_000, "importons": 10_000,
 DEPTH = 8
 ALBEDO = 0.5
 OVERLAP = 0.01              # of the furnace's walls
+ROUNDING = 5e-4             # relative error that the furnace is forgiven: Mitsuba's `path` finds 2.00038 +- 0.00005 in place of 2
 PASSES, SPP = 32, 64
-BLOCK = 4                   # pixels along each side of the blocks that are compared
+BLOCK = 8                   # pixels along each side of the blocks that are compared
 GARBAGE = 100               # particles of a record
+BELIEVED = 0.5              # BSDF fraction of records taught garbage, at least: at 0.1 paths weigh up to ten times as much with
+                            # each bounce, blocks are as skewed as 5, and t-tests find p < 0.001 six times too often
 
 
 def keep_the_furnace(specification: dict[str, Any], seed: int, level: float) -> Verdict:
@@ -78,7 +81,7 @@ def teach_garbage(guide: Guide, seed: int) -> None:
     guide.state = guide.representation.init(n, seed, guide.parallax)
     guide.learn_particles(ParticleBatch.from_arrays(mi.Vector3f(wo.T), mi.Float(rng.lognormal(0, 2, n * GARBAGE)),
                                                     mi.UInt32(np.repeat(np.arange(n), GARBAGE)), n), seed)
-    fraction, outgoing = rng.uniform(0.1, 0.9, n), rng.lognormal(0, 2, n)
+    fraction, outgoing = rng.uniform(BELIEVED, 0.9, n), rng.lognormal(0, 2, n)
     guide.rows = mi.Float(np.stack([np.ones(n), fraction, outgoing, np.zeros(n)], axis=1).ravel())
     assert guide.pixels is not None
     guide.pixels = PixelEstimate(rng.lognormal(0, 1, guide.pixels.luminance.shape))
@@ -98,7 +101,7 @@ def _test(p_values: PValues, images: np.ndarray, expected: np.ndarray, reference
     for size, what in ((images.shape[1], "the image"), (BLOCK, f"a block of {BLOCK} x {BLOCK} pixels")):
         a, b = blocks(images, size), blocks(expected[None], size)[0]
         if reference is None:
-            p = stats.ttest_1samp(a, b).pvalue
+            p = stats.ttest_1samp(a, np.clip(a.mean(0), b * (1 - ROUNDING), b * (1 + ROUNDING))).pvalue
         else:
             p = stats.ttest_ind(a, blocks(reference, size), equal_var=False).pvalue
         for i, value in enumerate(np.atleast_1d(p)):
