@@ -169,9 +169,9 @@ def _attributes(instance: Any) -> Any:
             return id(value), form(vars(value), depth + 1)
         return value if isinstance(value, bool | int | float | str | None) else id(value)
     classes = type(instance).__mro__[:-1]
-    modules = [getattr(verb, "__globals__", {}) for cls in classes for verb in vars(cls).values()]
-    variables = {k: v for module in modules for k, v in module.items() if not k.startswith("__")}
-    return form(vars(instance)), [form(dict(vars(cls))) for cls in classes], form(variables)
+    modules = {id(own): own for cls in classes for verb in vars(cls).values() if (own := getattr(verb, "__globals__", None))}
+    return form(vars(instance)), [form(dict(vars(cls))) for cls in classes], [
+        form({k: v for k, v in own.items() if not k.startswith("__")}) for own in modules.values()]
 
 
 def _bits(arrays: Any) -> dict[str, bytes]:
