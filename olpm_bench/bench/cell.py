@@ -1,8 +1,8 @@
 """One cell: warm up, train, render until the budget is spent.
 
-What is on the clock: training and rendering, evaluated and synchronised.  What is not: compilation (every kernel is
-compiled before the clock starts, and what was missed is taken off and counted), accumulation, checkpoints, files,
-progress.  Charged seconds are defined in :mod:`olpm_bench.bench.clock`.
+What is on the clock: making guides, training and rendering, evaluated and synchronised.  What is not: compilation
+(every kernel is compiled before the clock starts, and what was missed is taken off and counted), accumulation,
+checkpoints, files, progress.  Charged seconds are defined in :mod:`olpm_bench.bench.clock`.
 """
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from olpm_bench.bench.config import CellSpec
 from olpm_bench.bench.metrics import luminance
 from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
+from olpm_bench.transport.settings import TrainingSettings
 from olpm_bench.transport.training import PassStatistics, Training
 from olpm_bench.transport.view import records_seen
 
@@ -206,6 +207,14 @@ class _Cell:
         budget = self.spec.budget
         return self.image.spp / budget.spp if budget.spp is not None else self.clock.charged / (budget.seconds or 1)
 
+    def prepare(self, scene: mi.Scene, settings: TrainingSettings) -> Training:
+        """The training to come.  Its guides are made on the clock: a representation may work from the start."""
+        with self.clock.lap("train", self.kernels.compiled):
+            training = Training(scene, self.spec.method.representation or {}, settings, self.spec.integrator,
+                                self.spec.seed)
+            dr.sync_thread()
+        return training
+
     def train(self, training: Training) -> Iterator[PassStatistics]:
         """Training passes, until all are done or their share of a budget in seconds is spent."""
         settings, seconds = training.settings, self.spec.budget.seconds
@@ -294,7 +303,7 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
     with Kernels.watched() as kernels:
         cell = _Cell(spec, kernels)
         if guide is None and spec.training is not None:
-            training = Training(scene, spec.method.representation or {}, spec.training, spec.integrator, spec.seed)
+            training = cell.prepare(scene, spec.training)
             guide = training.radiance
             for statistics in cell.train(training):
                 if cell.image.passes:
@@ -315,7 +324,8 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
         "key": spec.key, "spp": image.spp, "charged_seconds": total.charged, "train_seconds": clock["train"].charged,
         "render_seconds": clock["render"].charged, "compile_seconds": warm.compile_seconds + kernels.seconds,
         "compiled_on_the_clock": kernels.count, "wall_seconds": total.wall, "cpu_seconds": total.cpu,
-        "wait_seconds": total.wait, "wait_fraction": total.wait / total.wall if total.wall else 0.0,
+        "paused_seconds": total.paused, "wait_seconds": total.wait,
+        "wait_fraction": total.wait / total.wall if total.wall else 0.0,
         "trained": records_seen(scene, guide).guided if guide is not None else None, "training_ended": ended,
         "training_passes": sum(p["index"] < p["passes"] for p in cell.training),       # not those while rendering
         "warnings": list(dict.fromkeys(w for p in cell.training for w in p["warnings"])),

@@ -1,11 +1,12 @@
 """Charged seconds: what a method is billed for, in the presence of neighbours.
 
-    charged = wall - waiting / threads
+    charged = wall - paused - waiting / threads
 
-where `waiting` is the time the process's threads were ready to run and found no core free, summed over threads
+where `paused` is the time in which the process was stopped or the machine slept (:mod:`olpm_bench.bench.pauses`),
+`waiting` is the time the process's threads were ready to run and found no core free, summed over threads
 (field 2 of ``/proc/self/task/*/schedstat``), and `threads` counts those that worked in the lap.  So serial code is
 charged in full and a neighbour's load is not.  Never less than CPU time / cores: more threads than cores wait for each
-other, which is the method's own doing.  Where the kernel keeps no such books, and on a GPU, charged = wall.
+other, which is the method's own doing.  Where the kernel keeps no such books, and on a GPU, charged = wall - paused.
 """
 from __future__ import annotations
 
@@ -16,8 +17,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
+from olpm_bench.bench.pauses import paused
+
 TASKS = Path("/proc/self/task")
-WAITED = 0.05       # share of its wall time spent waiting above which a cell is flagged: its machine was busy
+MAX_WAITED = 0.05   # share of its time spent waiting for cores above which a table says that the machine was busy, ...
+UNRELIABLE = 0.3    # ... and above which its timings are called unreliable, and a budget in seconds gets a second try
 WORKED = 0.01       # a thread worked in a lap if it ran at least this share of the busiest thread's time
 
 
@@ -44,11 +48,12 @@ def cores() -> int:
 @dataclass
 class Lap:
     """Totals of one label [s]."""
-    wall: float = 0.0
+    wall: float = 0.0           # without pauses
     cpu: float = 0.0            # summed over threads
     wait: float = 0.0           # share of `wall` spent waiting for a busy core
     compile: float = 0.0        # share of `wall` spent compiling
     charged: float = 0.0
+    paused: float = 0.0         # not in `wall`
 
     def __add__(self, other: Lap) -> Lap:
         return Lap(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
@@ -73,12 +78,12 @@ def charge(wall: float, cpu: float, before: dict[str, tuple[float, float]] | Non
 
 @dataclass
 class Clock:
-    """Accumulates laps by label; it stands still between them.
+    """Accumulates laps by label; it stands still between them, and while the process is paused.
 
     Stop it only after ``dr.eval`` and ``dr.sync_thread``: Dr.Jit works asynchronously.
 
     Args:
-        count_wait: subtract waiting for busy cores; False for a GPU, where charged = wall.
+        count_wait: subtract waiting for busy cores; False for a GPU, where that is no part of the work.
     """
     count_wait: bool = True
     laps: dict[str, Lap] = field(default_factory=dict)
@@ -91,11 +96,15 @@ class Clock:
             compiled: asked after the body how many seconds of it went into compilation, which is not charged.
         """
         before = thread_times() if self.count_wait else None
+        paused_before = paused()
         wall, cpu = time.perf_counter(), time.process_time()
         yield
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        pause = min(paused() - paused_before, wall)
+        wall -= pause
         after = thread_times() if self.count_wait else None
         lap = charge(wall, cpu, before, after, cores())
+        lap.paused = pause
         lap.compile = min(compiled(), wall)
         lap.charged *= 1 - lap.compile / wall if wall else 0.0      # the compiler waited for cores like everybody else
         self.laps[label] = self[label] + lap

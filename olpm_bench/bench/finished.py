@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from olpm_bench.bench import metrics, statistics
+from olpm_bench.bench.clock import UNRELIABLE
 from olpm_bench.bench.files import read_json
 from olpm_bench.bench.reference_file import NEAR_FLOOR, Reference
 from olpm_bench.bench.results import Cell, Results
@@ -115,6 +116,13 @@ class Finished:
         baseline = self.experiment.baseline_name
         return {method.name: {scene.scene.name: scene.speed_ups[method.name] for scene in self.compared}
                 for method in self.experiment.method if method.name != baseline}
+
+    @property
+    def unreliable(self) -> list[str]:
+        """The methods of which a cell waited for busy cores for so long that its timings can't be relied on."""
+        return [method.name for method in self.experiment.method
+                if any(cell.info["wait_fraction"] > UNRELIABLE
+                       for scene in self.scenes for cell in scene.cells[method.name])]
 
     @cached_property
     def machines(self) -> list[str]:

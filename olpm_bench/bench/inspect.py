@@ -145,14 +145,17 @@ def _train(scene: mi.Scene, spec: CellSpec, results: Results, on_progress: Calla
     """Train as the cell does."""
     assert spec.training is not None
     rooms = _rooms(spec)
-    training = Training(scene, spec.method.representation or {}, spec.training, spec.integrator, spec.seed,
-                        regions=(rooms[1], len(rooms[0])) if rooms else None)
-    cell, seconds, wanted = None, spec.budget.seconds, training.passes
-    if seconds is not None and (cell := results.read_cell(spec.scene.name, spec.method.name, spec.seed)) is not None:
-        wanted = min(wanted, cell.info["training_passes"])
+    seconds = spec.budget.seconds
+    cell = results.read_cell(spec.scene.name, spec.method.name, spec.seed) if seconds is not None else None
     clock, done, seen, told = Clock(count_wait=environment.uses_llvm()), list[PassStatistics](), 0.0, dict[str, None]()
-    passes = training.run()
     with cells.Kernels.watched() as kernels:
+        with clock.lap("train", kernels.compiled):
+            training = Training(scene, spec.method.representation or {}, spec.training, spec.integrator, spec.seed,
+                                regions=(rooms[1], len(rooms[0])) if rooms else None)
+            dr.sync_thread()
+        passes, wanted = training.run(), training.passes
+        if cell is not None:
+            wanted = min(wanted, cell.info["training_passes"])
         while len(done) < wanted and (cell is not None or clock.charged < cells.end_of_training(
                 spec.training.share, seconds, clock.charged, seen)):
             with clock.lap("train", kernels.compiled):

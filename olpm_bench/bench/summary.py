@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench import metrics, statistics
-from olpm_bench.bench.clock import WAITED
+from olpm_bench.bench.clock import MAX_WAITED, UNRELIABLE
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
 from olpm_bench.bench.reference_file import NEAR_FLOOR
 from olpm_bench.bench.results import Cell, Results, warnings
@@ -201,7 +201,10 @@ def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     found = []
     for row in rows:
         said = list(row["warnings"])
-        if row["wait_fraction"] > WAITED:
+        if row["wait_fraction"] > UNRELIABLE:
+            said.append(f"timings unreliable: other programs kept it from the processor for {row['wait_fraction']:.0%} of "
+                        "the time, so delete its cells and run it again on an idle machine")
+        elif row["wait_fraction"] > MAX_WAITED:
             said.append(f"waited {row['wait_fraction']:.0%} of its time for a busy core")
         if row["overrun"] is not None and row["overrun"] > LATE:
             said.append(f"took {row['overrun']:.0%} more time than its budget")

@@ -228,8 +228,10 @@ def caption(found: Finished, trained: bool = False, faint: bool = False) -> str:
 
 
 def machines(found: Finished) -> str:
-    """The machines that made the cells, as a sentence."""
-    return f"{'; '.join(found.machines)}."
+    """The machines that made the cells, and the methods whose timings can't be relied on, as sentences."""
+    unreliable = found.unreliable
+    warning = f" Timings unreliable, the machine was busy: {', '.join(unreliable)}." if unreliable else ""
+    return f"{'; '.join(found.machines)}.{warning}"
 
 
 def draw(panels: Sequence[Panel], title: str = "", note: str = "") -> Figure:

@@ -111,12 +111,15 @@ def test_one_slow_timing_does_not_make_passes_small(experiment, monkeypatch):
 # ---------------------------------------------------------------- training in a budget
 
 class Ticking(cell.Clock):
-    """Every lap takes a second."""
+    """Time passes as the stubs below say: a second a pass."""
+    now = 0.0
 
     @contextmanager
     def lap(self, label, compiled=float):
+        before = Ticking.now
         yield
-        self.laps[label] = self[label] + Lap(wall=1.0, cpu=1.0, charged=1.0)
+        took = Ticking.now - before
+        self.laps[label] = self[label] + Lap(wall=took, cpu=took, charged=took)
 
 
 class Passes:
@@ -124,10 +127,12 @@ class Passes:
     has the value i, and records have seen `seen` particles more after each."""
     camera_spp = 4
     seen = 1000.0
+    construction = 0.0      # [s]
 
     def __init__(self, scene, representation, settings, integrator, seed):
         self.settings, self.passes, self.learnt = settings, 2 + settings.camera_passes, 0
         self.radiance = SimpleNamespace(trained=1.0, records=9, particles=99, bytes_per_record=8)
+        Ticking.now += self.construction
 
     def run(self):
         for index in range(self.passes):
@@ -138,6 +143,7 @@ class Passes:
 
     def _pass(self, index, renders):
         before, self.learnt = self.learnt, self.learnt + 1
+        Ticking.now += 1
         image = SimpleNamespace(numpy=lambda: np.full((12, 16, 3), float(before))) if renders else None
         return PassStatistics(index, self.passes, spp=4 if renders else 0, seen=self.learnt * self.seen if renders else 0.0,
                               seconds={"trace": 0.3, "update": 0.1}, image=image)
@@ -151,11 +157,15 @@ def trained(experiment, monkeypatch):
         experiment.path.write_text(text)
         return cell.measure(experiment_file.load(experiment.path).cells()[1], None, WarmUp(0.0, spp_seconds))
 
+    def rendered(*_):
+        Ticking.now += 1
+        return SimpleNamespace(numpy=lambda: np.full((12, 16, 3), 100.0))
+
     monkeypatch.setattr(cell, "Clock", Ticking)
     monkeypatch.setattr(cell, "Training", Passes)
     monkeypatch.setattr(cell, "make_integrator", lambda spec, guide: None)
     monkeypatch.setattr(cell, "records_seen", lambda scene, guide: SimpleNamespace(guided=1.0))
-    monkeypatch.setattr(cell, "render_pass", lambda *_: SimpleNamespace(numpy=lambda: np.full((12, 16, 3), 100.0)))
+    monkeypatch.setattr(cell, "render_pass", rendered)
     return measured
 
 
@@ -169,6 +179,15 @@ def test_training_ends_at_its_share_and_its_second_half_enters(trained):
     expected = (4 * (4 + 5 + 6 + 7) + 100 * 12 * done.info["pass_spp"]) / done.info["spp"]
     np.testing.assert_allclose(done.image["mean"], expected, rtol=1e-6)
     assert done.trace[0]["seconds"] == 5 and done.trace[0]["spp"] == 4      # the first image is a training pass
+
+
+def test_what_a_representation_does_when_it_is_made_is_charged(trained, monkeypatch):
+    """Its constructor and `init(0)` take 3 s here: of 8 s of training 5 are left for passes."""
+    monkeypatch.setattr(Passes, "construction", 3.0)
+    done = trained("seconds = 20", "share = 0.4, camera_passes = 30, blend = false")
+    assert done.info["training_passes"] == 5
+    assert done.info["train_seconds"] == pytest.approx(8)
+    assert done.info["charged_seconds"] == pytest.approx(20)
 
 
 def test_training_may_end_before_its_share(trained):

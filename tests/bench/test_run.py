@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from small_experiment import TOML, edit
 
-from olpm_bench.bench import experiment_file, reference, run
+from olpm_bench.bench import experiment_file, finished, reference, run, summary
 from olpm_bench.bench.cell import CellFailedError
 from olpm_bench.bench.config import Experiment
 from olpm_bench.bench.files import ResultError, require_inside
 from olpm_bench.bench.lock import locked
 from olpm_bench.bench.reference_file import Reference, write_reference
 from olpm_bench.bench.results import Results
+from olpm_bench.report import figures
 from olpm_bench.transport import settings
 from olpm_bench.transport.settings import InputError
 
@@ -67,6 +68,26 @@ def test_a_rerun_skips_what_is_complete(experiment, root, monkeypatch):
     assert experiment_file.load(root / "test" / "experiment.toml").cells()[0].key == experiment.cells()[0].key
     monkeypatch.setattr(run, "measure", counted := Counted())
     assert run.run(experiment, root) == [] and counted.calls == 0
+
+
+@pytest.mark.parametrize("waited, kept, flagged", [((0.5, 0.1), 0.1, False), ((0.5, 0.7), 0.5, True)])
+def test_a_cell_on_a_busy_machine_is_measured_twice_and_then_flagged(experiment, root, monkeypatch, waited, kept,
+                                                                     flagged):
+    experiment.path.write_text(TOML.replace("spp = 11", "seconds = 0.2"))
+    timed = experiment_file.load(experiment.path)
+    shares = iter(waited)
+
+    def measure(*args, original=run.measure, **kwargs):
+        done = original(*args, **kwargs)
+        return dataclasses.replace(done, info={**done.info, "wait_fraction": next(shares, 0.0)})
+    monkeypatch.setattr(run, "measure", measure)
+    assert run.run(timed, root) == []
+    assert cells(timed, root)[0].info["wait_fraction"] == kept
+    found = finished.read(timed, Results(root / "test"), run.references(timed, root))
+    assert found.unreliable == (["Path tracing"] if flagged else [])
+    assert ("Timings unreliable, the machine was busy: Path tracing." in figures.machines(found)) == flagged
+    said = summary.notes(summary.summarise(found)["rows"])
+    assert any("Path tracing: timings unreliable" in note for note in said) == flagged
 
 
 def test_env_json_is_of_where_cells_were_made_and_scenes_are_loaded_for_those_alone(experiment, root, monkeypatch):
