@@ -46,6 +46,14 @@ class Difference(NamedTuple):
     bias_seen: float
     block_bias_seen: float
 
+    def __str__(self) -> str:
+        """How large a bias would have been seen, or that the images are apart; empty where no error is known."""
+        if self.apart > APART:
+            return f"the mean images are {self.apart:.0f} standard errors apart, as a whole or in a block"
+        shares = [f"{_share_of(share)} the mean of {what}" for share, what in (
+            (self.bias_seen, "the image"), (self.block_bias_seen, "a block")) if math.isfinite(share)]
+        return f"a bias of {', or of '.join(shares)} would have been seen" if shares else ""
+
 
 def means(cells: Sequence[Cell], images: CellImages) -> Means:
     """
@@ -88,6 +96,10 @@ def difference(a: Means, b: Means) -> Difference:
         shares = limit * block_errors / (a.blocks + b.blocks) * 2
     apart = max(_known(of_image), *(_known(z) for z in of_blocks))
     return Difference(apart, float(seen), float(np.median(shares)))
+
+
+def _share_of(share: float) -> str:
+    return f"{100 * share:.2g} % of" if share < 1 else f"{share:.2g} times"
 
 
 def _known(standard_errors: float) -> float:

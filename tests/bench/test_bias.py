@@ -16,7 +16,7 @@ SIZE, PASSES = (32, 48), 16
 def means(passes: np.ndarray) -> bias.Means:
     """Of cells with these passes (seeds, passes, h, w)."""
     of_passes = passes.mean(axis=(2, 3))
-    infos = [{"mean": x.mean(), "mean_stderr": x.std(ddof=1) / np.sqrt(len(x))} for x in of_passes]
+    infos = [{"mean": x.mean(), "mean_stderr": x.std(ddof=1) / np.sqrt(len(x)) if len(x) > 1 else np.nan} for x in of_passes]
     of_seeds = [Cell("a", "b", i, info, [], Path("cell")) for i, info in enumerate(infos)]
     return bias.means(of_seeds, cells(passes))
 
