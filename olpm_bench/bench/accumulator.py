@@ -10,9 +10,10 @@ import numpy as np
 class Accumulator:
     """Running mean of independent passes, and the variance of that mean from their spread.
 
-    A pass weighs as many as its samples are.  The variance is the sum of (weight (pass - mean))^2, as passes of training
-    may be noisier than later ones of another size, whose spread says nothing of theirs.  It is unbiased for passes of one
-    size, however much their noise differs, and for passes of one noise per sample, however much their sizes differ.
+    A pass weighs as many as its samples are.  The variance is the sum of (weight (pass - mean))^2, as passes
+    of training may be noisier than later ones of another size, whose spread says nothing of theirs.  It is
+    unbiased for passes of one size, however much their noise differs, and for passes of one noise per sample,
+    however much their sizes differ.
 
     Pixels are float64: a long render adds many small passes.
     """
@@ -30,7 +31,7 @@ class Accumulator:
 
     @staticmethod
     def resume(mean: np.ndarray, variance: np.ndarray, spp: int, passes: int) -> Accumulator:
-        """The accumulator whose mean, variance and counts these are, as if its passes had been of one size."""
+        """The accumulator with this mean, variance and counts, as if its passes had been of one size."""
         if passes == 0:
             return Accumulator.empty(*mean.shape[:2])
         mean = mean.astype(np.float64)

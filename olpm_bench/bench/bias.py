@@ -1,9 +1,9 @@
-"""The bias guard: do the mean images of two methods differ by more than their noise, in the whole or in a block of pixels?
+"""The bias guard: do two methods' mean images differ by more than their noise, as a whole or in a block of pixels?
 
-An unbiased estimator of few samples may look biased where rare samples carry the light, as it has met none of them.  So the
-error of a mean is the larger of those by the spread of passes and over seeds, and allows for one more outlier as large as the
-largest anywhere in the method's images.  Differences count from 6 standard errors on, and in blocks from so
-many that any block of the image exceeds them as rarely.
+An unbiased estimator of few samples may look biased where rare samples carry the light, as it has met none of
+them.  So the error of a mean is the larger of those by the spread of passes and over seeds, and allows for
+one more outlier as large as the largest anywhere in the method's images.  Differences count from 6 standard
+errors on, and in blocks from so many that any block of the image exceeds them as rarely.
 """
 from __future__ import annotations
 
@@ -37,14 +37,22 @@ class Means(NamedTuple):
 class Difference(NamedTuple):
     """How far the mean images of two methods are apart.
 
-    apart: standard errors, of the whole image or of the block that differs most, whichever counts more.  Those of a block are
-        scaled so that `APART` is the limit for them, too.  0 where no error is known.
-    bias_seen: the bias of the whole image that would have been seen, a share of its mean; NaN where that is not known.
-    block_bias_seen: that of the median block, a share of its mean; NaN where it is black, or no error is known.
+    apart: standard errors, of the whole image or of the block that differs most, whichever counts more.  Those of
+        a block are scaled so that `APART` is the limit for them, too.  0 where no error is known.
+    bias_seen: the bias of the whole image that would have been seen, a share of its mean; NaN where not known.
+    block_bias_seen: that of the median block, a share of its mean; NaN where it is black, or not known.
     """
     apart: float
     bias_seen: float
     block_bias_seen: float
+
+    def __str__(self) -> str:
+        """How large a bias would have been seen, or that the images are apart; empty where no error is known."""
+        if self.apart > APART:
+            return f"the mean images are {self.apart:.0f} standard errors apart, as a whole or in a block"
+        shares = [f"{_share_of(share)} the mean of {what}" for share, what in (
+            (self.bias_seen, "the image"), (self.block_bias_seen, "a block")) if math.isfinite(share)]
+        return f"a bias of {', or of '.join(shares)} would have been seen" if shares else ""
 
 
 def means(cells: Sequence[Cell], images: CellImages) -> Means:
@@ -52,7 +60,8 @@ def means(cells: Sequence[Cell], images: CellImages) -> Means:
     Args:
         cells, images: of a method in a scene, one per seed; the images are those of the cells.
     """
-    of_image, errors = (np.array([cell.info[key] for cell in cells], np.float64) for key in ("mean", "mean_stderr"))
+    of_image = np.array([cell.info["mean"] for cell in cells], np.float64)
+    errors = np.array([cell.info["mean_stderr"] for cell in cells], np.float64)
     n, (height, width) = len(cells), images.mean.shape[1:3]
     by_passes = float(np.mean(np.where(np.isnan(errors), np.inf, errors) ** 2))
     over_seeds = float(np.var(of_image, ddof=1)) if n > 1 else 0.0
@@ -61,7 +70,8 @@ def means(cells: Sequence[Cell], images: CellImages) -> Means:
     blocks = pixel_variance.blocks(height, width, side)
     of_block = np.stack([blocks.mean(image.mean(axis=-1)) for image in images.mean])
     deviations = np.sqrt(images.estimates).mean(axis=-1)                # at most, if channels vary together
-    by_passes_of_block = np.mean([blocks.mean(deviation**2) for deviation in deviations], axis=0) / blocks.sizes
+    variances = np.stack([blocks.mean(deviation**2) for deviation in deviations])
+    by_passes_of_block = variances.mean(axis=0) / blocks.sizes
     over_seeds_of_block = np.var(of_block, axis=0, ddof=1) if n > 1 else np.zeros(len(blocks.sizes))
     outlier = float(deviations.max()) / n
     error = math.sqrt(max(by_passes, over_seeds) / n + (outlier / (height * width)) ** 2)
@@ -86,6 +96,10 @@ def difference(a: Means, b: Means) -> Difference:
         shares = limit * block_errors / (a.blocks + b.blocks) * 2
     apart = max(_known(of_image), *(_known(z) for z in of_blocks))
     return Difference(apart, float(seen), float(np.median(shares)))
+
+
+def _share_of(share: float) -> str:
+    return f"{100 * share:.2g} % of" if share < 1 else f"{share:.2g} times"
 
 
 def _known(standard_errors: float) -> float:

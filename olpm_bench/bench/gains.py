@@ -1,22 +1,32 @@
 """Work-normalised variances of methods, and the gains of one over another, with their intervals.
 
-The work-normalised variance of a pixel is the variance of its colour (mean over channels) in the image of one cell, times the
-charged seconds of that cell, over the squared mean of the block of about 8 x 8 pixels around it plus 1/1000 of the image's
-squared mean.  Variances come from all passes of all cells; the mean is the reference's, or without one that of all cells of all
-methods in the scene.  Three numbers sum it up, and the gain of a method is the baseline's over its own:
+The work-normalised variance of a pixel is the variance of its colour (mean over channels) in the image of one
+cell, times the charged seconds of that cell, over the squared mean of the block of about 8 x 8 pixels around
+it plus 1/1000 of the image's squared mean.  Variances come from all passes of all cells; the mean is the
+reference's, or without one that of all cells of all methods in the scene.  Three numbers sum it up, and the
+gain of a method is the baseline's over its own:
 
 - "median": the median over blocks of the mean over a block;
 - "trimmed": the mean over pixels without the worst 0.1 % of pixels (rounded down);
 - "mean": the mean over all pixels.
 
-A median over pixels would be far too small where rare samples carry the light, as most pixels have met none of them, and a
-relative variance far too small where the mean is that of the same few samples.  Blocks pool them.
+A median over pixels would be far too small where rare samples carry the light, as most pixels have met none
+of them, and a relative variance far too small where the mean is that of the same few samples.  Blocks pool
+them.
 
-An interval is a 90 % jackknife over seeds, paired between methods, widened by the rule of three: events that have not been seen
-in n trials may have an expected number of 3.  So the upper end of a variance allows for three more outliers, in each block for a
-median.  In a gain they are as large as the largest that was seen; in a variance that stands alone twice as large, which is the
-mean size above the largest of outliers whose variance is barely finite (densities as x^-3).  There is no number without an
-interval, and none where too little light was met; then a sentence says why.
+An interval is a 90 % jackknife over seeds, paired between methods, widened by the rule of three: events that
+have not been seen in n trials may have an expected number of 3.  So the upper end of a variance allows for
+three more outliers, in each block for a median.  In a gain they are as large as the largest that was seen; in
+a variance that stands alone twice as large, which is the mean size above the largest of outliers whose
+variance is barely finite (densities as x^-3).  There is no number without an interval, and none where too
+little light was met; then a sentence says why.
+
+Measured on a door ajar by 7 cm (48 x 27 pixels, path tracing and two mixtures, 60 to 80 choices of 3 seeds): the
+intervals of gains hold the value of 48 seeds in 85 to 100 % of the choices at 64 samples a pixel, and that of 15 or
+17 seeds in 93 to 100 % at 1,024; those of variances that stand alone in 76 to 100 % and 95 to 100 %.  The low ones
+are of means over pixels where one cell in tens has an outlier as large as all else.  The allowances were chosen on
+these cells, and the 3 seeds are among the 48, so other scenes may be covered less.  Of log-normal passes, on which
+nothing was chosen, the intervals of 3 and 8 seeds hold the true variance in 90 to 100 % and the true gain in 84 to 91 %.
 """
 from __future__ import annotations
 
@@ -27,13 +37,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from olpm_bench.bench import pixel_variance, statistics
+from olpm_bench.bench.metrics import WORST
 from olpm_bench.bench.pixel_variance import Blocks, CellImages
 from olpm_bench.bench.statistics import Interval
 
 KINDS = ("median", "trimmed", "mean")
-WORST = 0.001               # share of pixels that "trimmed" leaves out
-UNSEEN = 3.0                # rule of three: 95 % of what is expected as often was seen
-ALONE = 2.0                 # size of the unseen outliers of a variance that stands alone, of the largest that was seen
+UNSEEN = 3.0                # rule of three: what is expected more often is seen with 95 % probability
+ALONE = 2.0                 # size of unseen outliers, of the largest seen, for a variance that stands alone
 MIN_SEEDS = 3               # two leave no interval
 MIN_EFFECTIVE_PASSES = 10.0     # of the passes of a block's pixels that met light
 MAX_SHARE = 0.5             # of a mean over pixels that a single pixel of a single cell may be
@@ -41,7 +51,7 @@ MAX_SHARE = 0.5             # of a mean over pixels that a single pixel of a sin
 
 @dataclass(frozen=True)
 class WorkVariance:
-    """The variances of the pixels of a method in a scene times charged seconds, for `estimate` and `gain` normalised.
+    """The variances of a method's pixels in a scene times charged seconds; `normalised` for `estimate` and `gain`.
 
     method: its name, for sentences.
     by_cell: (seeds, h, w) what each cell says of them; the mean over cells is the estimate.
@@ -66,7 +76,7 @@ class WorkVariance:
         return float(np.mean(without_worst(pixels) if kind == "trimmed" else pixels))
 
     def allowance(self, kind: str, outliers: float = UNSEEN) -> float:
-        """The factor by which the variance grows with so many more outliers as large as the largest that was seen.
+        """The factor by which the variance grows with so many more outliers as large as the largest one seen.
 
         For a median they are as large as the largest of each block, and in each block.
         """
@@ -75,8 +85,8 @@ class WorkVariance:
             return 1 + outliers * float(self.by_cell.max()) / self.by_cell.size / value
         largest = np.zeros(len(self.blocks.sizes))
         np.maximum.at(largest, self.blocks.number.ravel(), self.by_cell.max(axis=0).ravel())
-        grown = self.blocks.mean(self.by_cell.mean(axis=0)) + outliers * largest / (self.seeds * self.blocks.sizes)
-        return float(np.median(grown)) / value
+        unseen = outliers * largest / (self.seeds * self.blocks.sizes)
+        return float(np.median(self.blocks.mean(self.by_cell.mean(axis=0)) + unseen)) / value
 
     def largest_share(self, kind: str) -> float:
         """The largest share that a single pixel of a single cell has in a mean over pixels."""
@@ -95,8 +105,8 @@ class WorkVariance:
             if typical == 0:
                 return f"the median block of pixels is black in all {self.passes} passes of {self.method}"
             if typical < MIN_EFFECTIVE_PASSES:
-                return (f"in the median block of pixels the light of {self.method} is that of {typical:.2g} passes of a pixel, "
-                        f"and at least {MIN_EFFECTIVE_PASSES:.0f} are needed")
+                return (f"in the median block of pixels the light of {self.method} is that of {typical:.2g} passes of a "
+                        f"pixel, and at least {MIN_EFFECTIVE_PASSES:.0f} are needed")
         value = self.value(kind)
         if not value > 0:
             return f"the images of {self.method} have no noise"
@@ -116,7 +126,8 @@ def work_variance(method: str, images: CellImages) -> WorkVariance:
     height, width = images.mean.shape[1:3]
     blocks = pixel_variance.blocks(height, width)
     by_cell = images.estimates.mean(axis=-1) * images.seconds[:, None, None]
-    return WorkVariance(method, by_cell.astype(np.float32), blocks, _effective_passes(images, blocks), images.total_passes)
+    effective_passes = _effective_passes(images, blocks)
+    return WorkVariance(method, by_cell.astype(np.float32), blocks, effective_passes, images.total_passes)
 
 
 def normalised(variance: WorkVariance, radiance: np.ndarray) -> WorkVariance:
@@ -148,7 +159,7 @@ def estimate(variance: WorkVariance, kind: str) -> Interval:
 
 
 def gain(baseline: WorkVariance, method: WorkVariance, kind: str) -> Interval:
-    """The baseline's work-normalised variance over that of the method, by one of `KINDS`, or why there is none.
+    """The baseline's work-normalised variance over the method's, by one of `KINDS`, or why there is none.
 
     Raises:
         ValueError: numbers of seeds that differ.

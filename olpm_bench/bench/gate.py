@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import metrics, statistics
-from olpm_bench.bench.bias import APART
+from olpm_bench.bench import bias, metrics, statistics
 from olpm_bench.bench.config import Claim, ConfigError, Experiment
 from olpm_bench.bench.files import SCHEMA_VERSION
 from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Cell, Results
-from olpm_bench.bench.summary import apart, complete_cells, number, print_whole, work
+from olpm_bench.bench.summary import complete_cells, difference, number, print_whole, work
 from olpm_bench.bench.terminal import plain_console
 
 if TYPE_CHECKING:
@@ -29,26 +28,27 @@ LEAST_SEEDS = 8
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim in one scene: the measured ratio, the bounds that it keeps with the claim's confidence each, and by how many
-    standard errors the two mean images differ."""
+    """A claim in one scene: the measured ratio, the bounds that it keeps with the claim's confidence each, and how far the
+    two mean images differ."""
     scene: str
     claim: Claim
     ratio: float
     low: float
     high: float
-    apart: float
+    difference: bias.Difference
 
     @property
     def holds(self) -> bool:
-        return self.high <= self.claim.ratio and self.apart <= APART        # not for NaN
+        return self.high <= self.claim.ratio and self.difference.apart <= bias.APART        # not for NaN
 
     def __str__(self) -> str:
-        biased = f": the means are {self.apart:.0f} standard errors apart" if self.apart > APART else ""
-        return "holds" if self.holds else f"FAILS{biased}"
+        said = f": {self.difference}" if str(self.difference) else ""
+        return f"{'holds' if self.holds else 'FAILS'}{said}"
 
     def as_dict(self) -> dict[str, Any]:
         return {**self.claim.model_dump(exclude={"ratio"}), "claimed": self.claim.ratio, "holds": self.holds,
-                **{k: v for k, v in asdict(self).items() if k != "claim"}}
+                **{k: v for k, v in asdict(self).items() if k not in ("claim", "difference")},
+                **self.difference._asdict()}
 
 
 def check(experiment: Experiment) -> None:
@@ -81,7 +81,7 @@ def judge(experiment: Experiment, results: Results, references: dict[str, Refere
         for scene in experiment.scene:
             better, worse = cells[scene.name, claim.better], cells[scene.name, claim.worse]
             ratio = _ratio(claim, better, worse, references.get(scene.name))
-            verdicts.append(Verdict(scene.name, claim, ratio.value, ratio.low, ratio.high, apart(better, worse)))
+            verdicts.append(Verdict(scene.name, claim, ratio.value, ratio.low, ratio.high, difference(better, worse)))
     return verdicts
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from olpm_bench.report import tonemap
 
 EPSILON = 0.01          # of the relative metrics, in units of radiance
-WORST = 0.001           # fraction of pixels that relmse_trimmed leaves out
+WORST = 0.001           # fraction of pixels that trimmed means leave out
 
 
 @functools.cache

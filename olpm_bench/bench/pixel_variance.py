@@ -1,9 +1,9 @@
 """The variance of a pixel, from all passes of all cells of a method in a scene.
 
-The variance over 3 to 8 images, one per seed, says little of a pixel where rare samples carry the light: few of those images
-have met them.  Each cell therefore keeps, beside the mean of its passes, the variance of that mean from the spread of its
-passes.  The mean of these over the cells of all seeds is an unbiased estimate of the variance of one cell's image, at each
-pixel, that stands on every pass.
+The variance over 3 to 8 images, one per seed, says little of a pixel where rare samples carry the light: few of
+those images have met them.  Each cell therefore keeps, beside the mean of its passes, the variance of that mean
+from the spread of its passes.  The mean of these over the cells of all seeds is an unbiased estimate of the
+variance of one cell's image, at each pixel, that stands on every pass.
 """
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from olpm_bench.bench.results import Cell
 
 BLOCK = 8               # side of a block [pixels], about
-FLOOR = 1e-3            # of the image's squared mean, which is added to that of a block: black blocks don't count without end
+FLOOR = 1e-3            # of the image's squared mean, added to that of a block: black blocks don't count without end
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class PixelMoments:
     mean: (h, w, 3) of the cells' images, each weighing the same.
     variance: (h, w, 3) of the image of one cell; NaN where there is one cell of one pass.
     work: (h, w, 3) variance of the image of one cell times its charged seconds [s], the mean over cells.
-    effective_passes: (h, w) the number of passes of equal value that have the same mean and variance, at most all of them:
-        (sum x)^2 / sum x^2 of the pass values x.  It is 0 for a pixel that is black in all passes, 1 where a single pass met
-        light, and never above the number of passes that did.
+    effective_passes: (h, w) the number of passes of equal value that have the same mean and variance:
+        (sum x)^2 / sum x^2 of the pass values x.  It is 0 for a pixel that is black in all passes, 1 where a
+        single pass met light, and never above the number of passes that did.
     cells, passes: how many there are.
     """
     mean: np.ndarray
@@ -65,8 +65,8 @@ class CellImages:
     def estimates(self) -> np.ndarray:
         """(seeds, h, w, 3) what each cell says of the variance of an image; the mean over cells is unbiased.
 
-        Where a cell has a single pass, these are the squared distances from the mean over cells instead, so scaled that their
-        mean is unbiased; NaN for one cell.
+        Where a cell has a single pass, these are the squared distances from the mean over cells instead, so
+        scaled that their mean is unbiased; NaN for one cell.
         """
         if self.by_passes:
             return self.variance
@@ -118,7 +118,8 @@ def read(cells: Sequence[Cell]) -> CellImages:
 def passes_of(cell: Cell, variance: np.ndarray) -> int:
     """The number of passes in a cell's image.
 
-    Cells of earlier versions do not say it, but most tell how many samples a pass has; images of training passes count by that.
+    Cells of earlier versions do not say it, but most tell how many samples a pass has; images of training
+    passes count by that.
     Of others it is known only whether a variance could be measured: then there were two passes at least.
 
     Args:
@@ -150,7 +151,7 @@ class Blocks(NamedTuple):
 
 
 def blocks(height: int, width: int, side: float = BLOCK) -> Blocks:
-    """Blocks of equal shares of the image's height and width, as near to `side` pixels as whole numbers allow."""
+    """Blocks of equal shares of the height and width, as near to `side` pixels as whole numbers allow."""
     rows, columns = (max(1, round(n / side)) for n in (height, width))
     row, column = np.arange(height) * rows // height, np.arange(width) * columns // width
     number = row[:, None] * columns + column
@@ -158,7 +159,7 @@ def blocks(height: int, width: int, side: float = BLOCK) -> Blocks:
 
 
 def squared_radiance(radiance: np.ndarray, of: Blocks) -> np.ndarray:
-    """What variances are relative to (blocks): the squared mean of a block, averaged over channels, plus a share of the image's.
+    """What variances are relative to (blocks): a block's squared mean over channels, plus a share of the image's.
 
     Args:
         radiance: (h, w, 3) the reference, or the best mean that there is.

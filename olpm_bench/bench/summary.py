@@ -88,9 +88,10 @@ def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work
     return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
 
 
-def apart(a: Sequence[Cell], b: Sequence[Cell]) -> float:
-    """By how many standard errors the mean images of two methods differ, as `bias.Difference` says; `APART` is too many."""
-    return bias.difference(*(bias.means(cells, pixel_variance.read(cells)) for cells in (a, b))).apart
+def difference(a: Sequence[Cell], b: Sequence[Cell]) -> bias.Difference:
+    """How far the mean images of two methods are apart; each image is read once."""
+    of_a, of_b = (bias.means(cells, pixel_variance.read(cells)) for cells in (a, b))
+    return bias.difference(of_a, of_b)
 
 
 def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, Any]:
@@ -264,16 +265,11 @@ def bias_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """How large a bias would have been seen between the mean images of each method and the baseline, in words."""
     lines = []
     for row in rows:
-        if row["bias_seen"] is None or row["apart"] > APART:        # of the baseline, or unknown; or told by `notes`
-            continue
-        block = "" if row["block_bias_seen"] is None else f", or of {_share_of(row['block_bias_seen'])} a block's,"
-        lines.append(f"{row['scene']} / {row['method']}: its mean image agrees with the baseline's; a bias of "
-                     f"{_share_of(row['bias_seen'])} the image's mean{block} would have been seen")
+        shares = [np.nan if row[key] is None else row[key] for key in ("bias_seen", "block_bias_seen")]
+        seen = str(bias.Difference(row["apart"], *shares))
+        if seen and row["apart"] <= APART:          # that others are apart, `notes` says
+            lines.append(f"{row['scene']} / {row['method']}: its mean image agrees with the baseline's; {seen}")
     return lines
-
-
-def _share_of(value: float) -> str:
-    return f"{100 * value:.2g} % of" if value < 1 else f"{value:.2g} times"
 
 
 def _print_notes(summary: dict[str, Any], console: Console) -> None:

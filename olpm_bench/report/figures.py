@@ -166,7 +166,8 @@ def draw_gains(rows: Sequence[Mapping[str, Any]], looks: Mapping[str, int], base
         axes.plot(ends, [y, y], color=look["color"], linewidth=1.1, marker="|", markersize=5,
                   markeredgecolor=look["color"], markeredgewidth=0.9, linestyle="-")
         face = look["color"] if column == GAINS[0] else "white"
-        axes.plot(row[column], y, **{**look, "linestyle": "none"}, markersize=5, zorder=3, markerfacecolor=face)
+        axes.plot(row[column], y, **{**look, "linestyle": "none"}, markersize=5, zorder=3,
+                  markerfacecolor=face, markeredgecolor=look["color"])
     if title:
         figure.text(0.5, 1 - 0.08 / height, title, ha="center", va="top", fontsize=10.5)
     figure.text(0.1 / width, 0.04 / height, "\n".join(caption_), ha="left", va="bottom", fontsize=6.5, color="#555555",

@@ -130,7 +130,9 @@ def test_who_is_biased_is_not_better(known):
         edit(cell, mean=0.6, mean_stderr=0.001)
     verdict, = judge(experiment)
     assert verdict.high < 1 and not verdict.holds
-    assert str(verdict) == f"FAILS: the means are {verdict.apart:.0f} standard errors apart" and verdict.apart > gate.APART
+    apart = verdict.difference.apart
+    assert str(verdict) == f"FAILS: the mean images are {apart:.0f} standard errors apart, as a whole or in a block"
+    assert apart > gate.bias.APART
 
 
 def test_claims_come_back_from_the_results_folder(known):
