@@ -9,10 +9,10 @@ import dataclasses
 import functools
 import hashlib
 import importlib.metadata
-import inspect
 import json
 import os
 import shlex
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 
 import representations
 from olpm_bench import scenes as embedded
-from olpm_bench import transport
+from olpm_bench import shipped, transport
 from olpm_bench.bench import environment
 from olpm_bench.bench.files import SCHEMA_VERSION, slug
 from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
@@ -131,8 +131,15 @@ class Scene(Table):
         return dict(self.overrides) if self.file is not None else embedded.resolve(self.name, self.parameters)
 
     def digest(self) -> str:
-        """Hash of all that determines the scene's radiance."""
-        return embedded.digest(self.file or self.name, self.arguments)
+        """Hash of all that determines the scene's radiance; its files are read once, for all cells and references of it."""
+        what = json.dumps([self.source, self.arguments], sort_keys=True, default=str)
+        if what not in self._digests:
+            self._digests[what] = embedded.digest(self.file or self.name, self.arguments)
+        return self._digests[what]
+
+    @functools.cached_property
+    def _digests(self) -> dict[str, str]:
+        return {}
 
 
 class Series(Table):
@@ -289,7 +296,7 @@ class Experiment(Table):
         """The command `name` of this experiment, for a shell; `root` is the `--results` folder."""
         scale = ["--scale", self._scale] if self._scale is not None else []
         scenes = [f"--scene={scene}={file}" for scene, file in self._scenes.items()]
-        return shlex.join(["olpm-bench", name, str(self.path), *scale, "--results", str(root), *scenes])
+        return shlex.join(["olpm-bench", name, shipped.named(self.path), *scale, "--results", str(root), *scenes])
 
     @field_validator("schema_version")
     @classmethod
@@ -318,9 +325,10 @@ class Experiment(Table):
     def _distinct(self) -> Experiment:
         for kind, names in (("methods", [m.name for m in self.method]), ("scenes", [s.name for s in self.scene])):
             folders: dict[str, str] = {}
+            count = Counter(names)
             for name in names:
                 other = folders.setdefault(slug(name).lower(), name)
-                if names.count(name) > 1:
+                if count[name] > 1:
                     raise ValueError(f"two {kind} of one name {name!r}; names must differ")
                 if other != name:
                     raise ValueError(f"{kind} {other!r} and {name!r} would share the folder '{slug(name)}', at least where "
@@ -333,9 +341,10 @@ class Experiment(Table):
                     raise ValueError(f"[[claim]] {number}: {key} = {name!r}: no method of this name; known: {', '.join(known)}")
             if claim.better == claim.worse:
                 raise ValueError(f"[[claim]] {number}: {claim.better!r} is compared with itself")
+        depths = {scene.max_depth: scene for scene in self.scene}       # all that a scene changes of a method's settings
         for method in self.method:
             self.training_of(method)
-            for scene in self.scene:
+            for scene in depths.values():
                 self.integrator_of(scene, method)
         return self
 
@@ -382,8 +391,14 @@ class Experiment(Table):
     def cells(self) -> list[CellSpec]:
         """Every cell in the order of running: methods innermost, so that they share the machine's good and bad
         hours."""
-        return [CellSpec(scene, method, seed, self.integrator_of(scene, method), self.training_of(method), self.budget)
-                for scene in self.scene for seed in self.seeds for method in self.method]
+        cells = []
+        trainings = [self.training_of(method) for method in self.method]
+        for scene in self.scene:
+            integrators = [self.integrator_of(scene, method) for method in self.method]
+            settings = list(zip(self.method, integrators, trainings, strict=True))
+            cells += [CellSpec(scene, method, seed, integrator, training, self.budget)
+                      for seed in self.seeds for method, integrator, training in settings]
+        return cells
 
     def of_scenes(self, names: Sequence[str]) -> Experiment:
         """The experiment with some of its scenes only; with all of them if none is named.
@@ -400,7 +415,7 @@ class Experiment(Table):
     def of_results(self, folder: Path) -> Experiment:
         """The experiment that was read from its results, under the name of the file that they were made from."""
         named, (stem, _, scale) = self.model_copy(), folder.name.rpartition("-")
-        original, scaled = (Path("experiments") / f"{name}.toml" for name in (folder.name, stem))
+        original, scaled = (shipped.experiment_file(Path("experiments") / f"{name}.toml") for name in (folder.name, stem))
         if scaled.is_file() and not original.is_file():
             named._path, named._scale = scaled, scale
         else:
@@ -465,10 +480,19 @@ def _representation_defaults(method: Method) -> dict[str, Any] | None:
     """The representation's table with every hyper-parameter."""
     if method.representation is None:
         return None
-    signature = inspect.signature(representations.find(method.representation["type"]))
-    defaults = {name: p.default for name, p in signature.parameters.items()
-                if isinstance(p.default, (bool, int, float, str, list))}
-    return {**defaults, **method.representation}
+    return {**_defaults(method.representation["type"], _representation_code(method)), **method.representation}
+
+
+@functools.cache
+def _defaults(representation: str, code: str | None) -> dict[str, Any]:
+    """The hyper-parameters of a representation; found once for all methods that have it, as long as its file stays as it is.
+
+    Args:
+        code: hash of that file, if it has one.
+    """
+    parameters = representations.parameters_of(representations.find(representation))
+    return {name: p.default for name, p in parameters.items()
+            if isinstance(p.default, (bool, int, float, str, list))}
 
 
 def _without_none(value: Any) -> Any:

@@ -11,6 +11,7 @@ import json
 import shlex
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -96,19 +97,24 @@ def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Pat
         raise ConfigError(f"{source} {TOO_DEEP}") from None
     for scene in experiment.scene:
         _check_scene(scene, source, replaceable=scenes is not None)
+    classes: dict[str, Any] = {}            # a sweep has one class: its file is run once
     for method in experiment.method:
-        announce(method.representation_name)
+        if (name := method.representation_name) is None:
+            continue
+        announce(name)
         try:
-            method.create()
+            if name not in classes:
+                classes[name] = representations.find(name)
+            representations.instance(classes[name], name, method.representation_parameters)
         except representations.RepresentationError as error:
             raise ConfigError(f"{source} [[method]] {method.name!r}: {error}") from None
     return experiment
 
 
 @functools.cache
-def announce(representation: str | None) -> None:
+def announce(representation: str) -> None:
     """Say on the terminal, once, that code is run which is not ours: that of FILE.py:Class."""
-    found = representations.file_of(representation or "")
+    found = representations.file_of(representation)
     if found is not None and found[0].is_file():
         print(one_line(f"olpm-bench: runs the code of {found[0]}"), file=sys.stderr)
 
@@ -184,9 +190,9 @@ def _without_sweeps(data: dict[str, Any]) -> dict[str, Any]:
     methods = data.get("method")
     if not isinstance(methods, list):
         return data
-    names = [method.get("name") for method in _tables(methods)]
+    count = Counter(repr(method.get("name")) for method in _tables(methods))
     for method in _tables(methods):
-        if "sweep" in method and names.count(method.get("name")) > 1:
+        if "sweep" in method and count[repr(method.get("name"))] > 1:
             raise InputError(f"two methods of one name {method.get('name')!r}; names must differ")
     return data | {"method": [m for method in methods for m in (expanded(method) if isinstance(method, dict) else [method])]}
 

@@ -196,6 +196,8 @@ def with_changes(settings: Settings, changes: dict[str, Any]) -> Settings:
     Raises:
         InputError: a key that is no field (the message lists them), or a value of a wrong type or out of its range.
     """
+    if not changes:
+        return settings
     known = [f.name for f in dataclasses.fields(settings)]  # type: ignore[arg-type]
     for key in changes:
         if key not in known:
