@@ -123,7 +123,7 @@ def test_the_commands_that_are_suggested_are_those_that_work(tmp_path, monkeypat
         words = shlex.split(command)
         assert words[0] == "olpm-bench" and words[1] in ("run", "reference")
         assert words[2:] == ["test.toml", "--scale", "small", "--results", "out", "--scene=room=my room.xml"]
-    result = CliRunner().invoke(app, [*words[1:], "--dry-run"])
+    result = CliRunner().invoke(app, [*words[1:], "--dry-run", "--with-reference"])
     assert words[1] == "run" and result.exit_code == 0, result.output
     results.write_text("experiment.toml", small.toml(results.folder))
     Path("experiments").mkdir()
