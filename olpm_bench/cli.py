@@ -15,8 +15,9 @@ from typing import Annotated, Any
 
 import typer
 
-from olpm_bench import shipped
+from olpm_bench import __version__, shipped
 from olpm_bench.bench.terminal import one_line
+from olpm_bench.examples import epilog
 from olpm_bench.transport.settings import InputError
 from representations import RepresentationError
 from representations._llvm import LLVMError
@@ -27,9 +28,10 @@ RESUMED = ("run", "submit", "gate", "reference")
 MAX_SEED = 2**15 - 1        # of cells: `config.MAX_SEED`, whose import would take a second of every --help
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
-                  help="Which learnt directional distribution guides a path tracer best?")
+                  epilog=epilog())
 
-ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", show_default=False)]
+ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT", show_default=False,
+                                                help="A TOML, or the name of an experiment that comes with olpm-bench.")]
 ResultsFolder = Annotated[Path, typer.Option(
     "--results", metavar="DIR", help="Results go to DIR/<stem of the TOML>, references to DIR/references.")]
 Replacements = Annotated[list[str], typer.Option(
@@ -39,6 +41,18 @@ Scale = Annotated[str | None, typer.Option(
 Only = Annotated[list[str], typer.Option("--only-scene", metavar="NAME", help="Leave the other scenes for later.")]
 Assignments = Annotated[list[str], typer.Option(
     "--set", metavar="TABLE.KEY=VALUE", help="Change a setting; keys as in the TOML.")]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"olpm-bench {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_show_version,
+                                                  help="Show the version, and exit.")] = False) -> None:
+    """Which learnt directional distribution guides a path tracer best?"""
 
 
 def complain(message: str) -> None:
@@ -84,7 +98,8 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
-    return app.command(body.__name__.strip("_"))(run)
+    name = body.__name__.strip("_")
+    return app.command(name, epilog=epilog(name))(run)
 
 
 def _interrupt(signum: int, frame: object) -> None:
@@ -456,29 +471,21 @@ def perf(scene: Annotated[str, typer.Option(metavar="NAME|FILE.xml", help="What 
 
 @command
 def list_() -> None:
-    """Show scenes, representations and experiments."""
-    import tomllib
+    """Show scenes, representations with their parameters (name, type, default), and experiments."""
+    from olpm_bench.bench import listing
 
-    import representations
-    from olpm_bench import scenes
+    for line in listing.lines():
+        print(line)
 
-    print("Scenes")
-    for name, description in scenes.names().items():
-        given = ", ".join(f"{k} = {v}" for k, v in scenes.parameters(name).items())
-        print(f"  {name}: {description}{f'  ({given})' if given else ''}")
-    print("  or any Mitsuba XML\nRepresentations")
-    for name in representations.names():
-        print(f"  {name}")
-    print("  or path/to/file.py:ClassName\nExperiments")
-    files = sorted(Path("experiments").glob("*.toml"))
-    for file in files:
-        try:
-            title = tomllib.loads(file.read_text(encoding="utf-8")).get("title", "")
-        except (OSError, ValueError, RecursionError) as error:
-            title = f"cannot be read: {error}"
-        print(one_line(f"  {file}: {title}"))
-    if not files:
-        print("  none in ./experiments")
+
+@command
+def new(kind: Annotated[str, typer.Argument(metavar="experiment|representation", show_default=False)],
+        name: Annotated[str, typer.Argument(metavar="NAME", show_default=False)]) -> None:
+    """Write NAME.toml or NAME.py: an experiment, or a representation, that runs as it is and explains itself."""
+    from olpm_bench.bench import new as beginning
+
+    path = beginning.new(kind, name)
+    print(f"wrote {path}; next: {beginning.next_step(kind, path)}")
 
 
 def main() -> None:

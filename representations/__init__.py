@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from representations import _llvm
+from representations.suggest import closest
 
 _llvm.select()          # before the first `import drjit` of the process
 
@@ -66,7 +67,8 @@ def find(name: str) -> Any:
             raise RepresentationError(f"representation '{name}', entry point {entry.value}, {_reason(error)}") from error
     if (found := file_of(name)) is not None:
         return _from_file(*found)
-    raise RepresentationError(f"unknown representation '{name}'; known: {', '.join(names())}, or path/to/file.py:ClassName")
+    raise RepresentationError(f"unknown representation '{name}'; known: {', '.join(names())}, or path/to/file.py:ClassName"
+                              + closest(name, names()))
 
 
 def create(type: str, **parameters: Any) -> Any:
@@ -87,7 +89,7 @@ def instance(cls: Any, type: str, parameters: dict[str, Any]) -> Any:
         for key, value in parameters.items():
             if key not in known:
                 raise RepresentationError(f"representation '{type}' has no parameter '{key}'; "
-                                          f"known: {', '.join(known) or 'none'}")
+                                          f"known: {', '.join(known) or 'none'}{closest(key, known)}")
             if (allowed := wrong_type(value, known[key].default)) is not None:
                 raise RepresentationError(f"representation '{type}': {key} = {value!r}: must be {allowed}")
         return cls(**parameters)

@@ -256,7 +256,7 @@ class _Cell:
         image = to_numpy(rendered)
         check_pixels(image, source)
         self.image.add(image, spp)
-        self.brightness.add(np.float64(metrics.mean(image)), spp)
+        self.brightness.add(np.full((1, 1, 1), metrics.mean(image)), spp)
 
     def checkpoint(self, guide: Guide | None) -> None:
         """Keep the image, if it is time to."""

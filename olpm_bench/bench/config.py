@@ -27,6 +27,7 @@ from olpm_bench import shipped, transport
 from olpm_bench.bench import environment
 from olpm_bench.bench.files import SCHEMA_VERSION, slug
 from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
+from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes
 
 LEAST_SECONDS = 1e-3        # of a budget: a pass takes longer
@@ -217,7 +218,7 @@ class Claim(Table):
     @classmethod
     def _known(cls, value: str) -> str:
         if value not in (known := [*METRICS, *OVER_SEEDS]):
-            raise ValueError(f"must be one of {', '.join(known)}")
+            raise ValueError(f"must be one of {', '.join(known)}{closest(value, known)}")
         return value
 
 
@@ -334,11 +335,13 @@ class Experiment(Table):
                     raise ValueError(f"{kind} {other!r} and {name!r} would share the folder '{slug(name)}', at least where "
                                      "upper case is lower case; names must differ")
         if self.baseline_name not in (known := [m.name for m in self.method]):
-            raise ValueError(f"baseline = {self.baseline!r}: no method of this name; known: {', '.join(known)}")
+            raise ValueError(f"baseline = {self.baseline!r}: no method of this name; known: {', '.join(known)}"
+                             + closest(self.baseline_name, known))
         for number, claim in enumerate(self.claim, 1):
             for key, name in (("better", claim.better), ("worse", claim.worse)):
                 if name not in known:
-                    raise ValueError(f"[[claim]] {number}: {key} = {name!r}: no method of this name; known: {', '.join(known)}")
+                    raise ValueError(f"[[claim]] {number}: {key} = {name!r}: no method of this name; known: {', '.join(known)}"
+                                     + closest(name, known))
             if claim.better == claim.worse:
                 raise ValueError(f"[[claim]] {number}: {claim.better!r} is compared with itself")
         depths = {scene.max_depth: scene for scene in self.scene}       # all that a scene changes of a method's settings
@@ -409,7 +412,7 @@ class Experiment(Table):
         known = [scene.name for scene in self.scene]
         for name in names:
             if name not in known:
-                raise ConfigError(f"no scene {name!r} in {self.path.name}; known: {', '.join(known)}")
+                raise ConfigError(f"no scene {name!r} in {self.path.name}; known: {', '.join(known)}{closest(name, known)}")
         return self.model_copy(update={"scene": [scene for scene in self.scene if not names or scene.name in names]})
 
     def of_results(self, folder: Path) -> Experiment:

@@ -20,10 +20,12 @@ from pydantic import BaseModel, ValidationError
 
 import representations
 from olpm_bench import scenes as embedded
+from olpm_bench import shipped
 from olpm_bench.bench.config import NO_REFERENCE, Budget, Claim, ConfigError, Experiment, Method, Scene, SweepFigure
 from olpm_bench.bench.scale import scaled
 from olpm_bench.bench.sweep import expanded
 from olpm_bench.bench.terminal import one_line
+from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, preset_of
 
 TABLES = {"budget": Budget, "scene": Scene, "method": Method, "claim": Claim, "sweep": SweepFigure,
@@ -52,7 +54,7 @@ def load(path: Path | str, scenes: dict[str, Path] | None = None, scale: str | N
             raise OSError("no regular file")        # some never end
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"experiment file {path}: there is no such file") from None
+        raise ConfigError(f"experiment file {path}: there is no such file{closest(path.stem, shipped.experiments())}") from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"experiment file {path}: cannot be read: {error}") from None
     try:
@@ -155,7 +157,7 @@ def _replace_scenes(data: dict[str, Any], scenes: dict[str, Path], source: str) 
     for name, file in scenes.items():
         if name not in known:
             raise ConfigError(f"--scene {name}={file}: no scene '{name}' in {source}; "
-                              f"known: {', '.join(known)}")
+                              f"known: {', '.join(known)}{closest(name, known)}")
         known[name]["file"] = str(Path(file).resolve())
 
 
@@ -170,7 +172,8 @@ def _check_scene(scene: Scene, source: str, replaceable: bool) -> None:
     else:
         known = embedded.names()
         if scene.name not in known:
-            raise ConfigError(f"{where}: unknown scene; known: {', '.join(known)}, or give file = \"scene.xml\"")
+            raise ConfigError(f"{where}: unknown scene; known: {', '.join(known)}, or give file = \"scene.xml\""
+                              + closest(scene.name, known))
         if scene.overrides:
             raise ConfigError(f"{where}: overrides belong to files; an embedded scene takes parameters")
         try:
@@ -258,7 +261,7 @@ def _explain(error: ValidationError, source: str) -> str:
             known.insert(0, "preset")
         if cls is Method:
             known.append("sweep")
-        return f"unknown key '{keys[-1]}' in {where}; known: {', '.join(known)}"
+        return f"unknown key '{keys[-1]}' in {where}; known: {', '.join(known)}{closest(str(keys[-1]), known)}"
     if first["type"] in ("missing", "missing_argument"):
         return f"missing key '{keys[-1]}' in {where}" if keys else f"missing table '{table}' in {source}"
     if not keys and table is not None and not isinstance(first["input"], dict):     # the table itself is none

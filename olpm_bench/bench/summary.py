@@ -66,8 +66,8 @@ def summarise(finished: Finished) -> dict[str, Any]:
     """The summary of an experiment: ``{"schema_version", "rows"}``, one row a scene and method, in the TOML's order.
 
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
-    `mean` is the mean of `metrics.mean` with its standard error, `compile_seconds` and `wait_fraction` are the largest, and `overrun` is the
-    largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.  `gain` is the
+    `mean` is the mean of `metrics.mean` with its standard error, `compile_seconds` and `wait_fraction` are the largest, and
+    `overrun` is the largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.  `gain` is the
     baseline's work-normalised variance over the method's, with its 90 % jackknife interval, `speed_up` how many times as fast
     it is to equal L1 (at least, or at most, by `speed_up_bound` ">" or "<"), `worst_speed_up` by `statistics.worst_speed_up`,
     `apart` by `apart` from the baseline, `memory` by `Cell.memory` [bytes], and `guided` the share of the surfaces that the
