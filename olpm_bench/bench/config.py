@@ -9,11 +9,12 @@ import dataclasses
 import functools
 import hashlib
 import importlib.metadata
+import itertools
 import json
 import os
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -166,12 +167,14 @@ class Method(Table):
     representation: ``{ type = name, ...hyper-parameters }``; none traces unguided.
     integrator, training: what differs from the experiment's own tables.
     series: of a method that a ``sweep`` has made, see :mod:`olpm_bench.bench.sweep`.
+    look: number of its colour, marker and dash in figures; by default its place among the methods, also at scales with fewer.
     """
     name: Label = Field(min_length=1)
     representation: dict[str, Any] | None = None
     integrator: dict[str, Any] = {}
     training: dict[str, Any] = {}
     series: Series | None = None
+    look: int | None = Field(None, ge=0, lt=1000)
 
     @model_validator(mode="after")
     def _sensible(self) -> Method:
@@ -368,10 +371,18 @@ class Experiment(Table):
 
         The methods of a sweep share one where there are too many to tell apart.  As a curve, a sweep looks as its last method.
         """
-        alike = {m.name: m.series.name if m.series is not None and len(self.method) > LOOKS else m.name for m in self.method}
-        numbers = {name: number for number, name in enumerate(dict.fromkeys(alike.values()))}
-        methods = {name: numbers[look] for name, look in alike.items()}
-        return methods | {m.series.name: methods[m.name] for m in self.method if m.series is not None}
+        return looks_of([(m.name, None if m.series is None else m.series.name, m.look) for m in self.method])
+
+    def looking_as(self, known: Mapping[str, int]) -> Experiment:
+        """The experiment whose methods have the looks that are known of their names, and others have looks that are free."""
+        now, taken, wanted = self.looks, set(known.values()), {}
+        free = (number for number in itertools.count() if number not in taken)
+        for m in self.method:
+            shared = m.series.name if m.series is not None and len(self.method) > LOOKS else m.name
+            wanted[m.name] = known[m.name] if m.name in known else known[shared] if shared in known else next(free)
+        if all(now[name] == look for name, look in wanted.items()):
+            return self
+        return self.model_copy(update={"method": [m.model_copy(update={"look": wanted[m.name]}) for m in self.method]})
 
     def integrator_of(self, scene: Scene, method: Method) -> IntegratorSettings:
         changes = dict(method.integrator)
@@ -460,6 +471,8 @@ class Experiment(Table):
             table["integrator"] = {k: v for k, v in integrator.items() if k != "max_depth"}
             if method.series is not None:
                 table["series"] = method.series.model_dump()
+            if method.look is not None:
+                table["look"] = method.look
             methods.append(table)
         return {
             "schema_version": SCHEMA_VERSION, "title": self.title, "description": self.description, "seeds": self.seeds,
@@ -471,6 +484,18 @@ class Experiment(Table):
     def toml(self, relative_to: Path | None = None) -> str:
         """`resolved` as TOML; reading it back gives the same cells."""
         return tomli_w.dumps(_without_none(self.resolved(relative_to)))
+
+
+def looks_of(methods: Sequence[tuple[str, str | None, int | None]]) -> dict[str, int]:
+    """Name of a method or of a sweep -> number of its look, see `Experiment.looks`.
+
+    Args:
+        methods: their names, those of their sweeps, and the looks that they ask for.
+    """
+    alike = {name: series if series is not None and len(methods) > LOOKS else name for name, series, _ in methods}
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(alike.values()))}
+    found = {name: numbers[alike[name]] if look is None else look for name, _, look in methods}
+    return found | {series: found[name] for name, series, _ in methods if series is not None}
 
 
 def reference_key(scene: Scene, max_depth: int) -> str:

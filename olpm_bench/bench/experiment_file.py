@@ -21,7 +21,17 @@ from pydantic import BaseModel, ValidationError
 import representations
 from olpm_bench import scenes as embedded
 from olpm_bench import shipped
-from olpm_bench.bench.config import NO_REFERENCE, Budget, Claim, ConfigError, Experiment, Method, Scene, SweepFigure
+from olpm_bench.bench.config import (
+    NO_REFERENCE,
+    Budget,
+    Claim,
+    ConfigError,
+    Experiment,
+    Method,
+    Scene,
+    SweepFigure,
+    looks_of,
+)
 from olpm_bench.bench.scale import scaled
 from olpm_bench.bench.sweep import expanded
 from olpm_bench.bench.terminal import one_line
@@ -63,15 +73,31 @@ def load(path: Path | str, scenes: dict[str, Path] | None = None, scale: str | N
         raise ConfigError(f"{path.name} is not valid TOML: {error}") from None
     except RecursionError:
         raise ConfigError(f"{path.name} {TOO_DEEP}") from None
-    source = path.name
+    source, whole = path.name, data
     if scale is not None:
         try:
             data, source = scaled(data, scale, source), f"{source} --scale {scale}"
         except InputError as error:
             raise ConfigError(str(error)) from None
     experiment = parse(data, source, path.parent, scenes or {})
+    if scale is not None:
+        experiment = experiment.looking_as(_looks(whole))
     experiment._path, experiment._scale, experiment._scenes = path, scale, dict(scenes or {})
     return experiment
+
+
+def _looks(whole: dict[str, Any]) -> dict[str, int]:
+    """How the methods of a file look at its full scale, as far as that is right there."""
+    try:
+        methods = list(_tables(_without_sweeps(whole).get("method")))
+    except InputError:
+        return {}
+    named = []
+    for method in methods:
+        series, look = method.get("series"), method.get("look")
+        named.append((str(method.get("name")), str(series.get("name")) if isinstance(series, dict) else None,
+                      look if isinstance(look, int) else None))
+    return looks_of(named)
 
 
 def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Path] | None = None) -> Experiment:

@@ -105,7 +105,8 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
         for index, (pixel, at) in enumerate(vertices.items()):
             truth = vertex.truth(loaded, at, specs[0].integrator, best, passes, seed=path_seed,
                                  on_pass=progress(len(guided) + index, f"truth at {pixel[0]},{pixel[1]}"))
-            columns = [_column(loaded, spec, at, truth, learnt.get(spec.method.name)) for spec in specs]
+            columns = [_column(loaded, spec, experiment.looks[spec.method.name], at, truth, learnt.get(spec.method.name))
+                       for spec in specs]
             title = f"{name}, pixel {pixel[0]},{pixel[1]}: vertex {at.number}, on {at.shape}"
             bar.say(f"{title}; noise of a sample: {', '.join(f'{c.name} {c.sampled.deviation:.2f}' for c in columns)}")
             written += _write(picture.Page(title, image, shown, pixel, at, truth, columns, last), folder / "inspect", specs[0])
@@ -244,13 +245,14 @@ def _by_room(learnt: Mapping[str, Learnt], rooms: Sequence[str], out: Path, scen
     return written
 
 
-def _column(scene: mi.Scene, spec: CellSpec, at: vertex.Vertex, truth: vertex.Truth, learnt: Learnt | None) -> picture.Column:
+def _column(scene: mi.Scene, spec: CellSpec, look: int, at: vertex.Vertex, truth: vertex.Truth,
+            learnt: Learnt | None) -> picture.Column:
     density = vertex.density(scene, at, learnt.guide if learnt else None, spec.integrator.fraction, truth.bins)
     particles = {}
     if learnt is not None and density.record is not None:
         particles = {kind: vertex.particles(batch, learnt.guide, at, density.record) for kind, batch in learnt.batches.items()}
     return picture.Column(
-        spec.method.name, density, vertex.fit(truth.incident, density.guide) if density.guide is not None else None,
+        spec.method.name, look, density, vertex.fit(truth.incident, density.guide) if density.guide is not None else None,
         vertex.fit(truth.reflected, density.mixture), particles)
 
 
