@@ -12,16 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import metrics, statistics
+from olpm_bench.bench import advice, metrics, statistics
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
-from olpm_bench.bench.reference_file import NEAR_FLOOR
 from olpm_bench.bench.results import Cell, Results, warnings
 from olpm_bench.bench.terminal import plain_console
 
 APART = 6.0                 # standard errors between the mean images of two methods, beyond which that is said
-LATE = 0.05                 # share of a budget in seconds by which a cell may exceed it, before that is said
-SLOWER = 0.95               # `worst_speed_up` below which that is said
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -203,12 +200,7 @@ def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         said = list(row["warnings"])
         if row["wait_fraction"] > WAITED:
             said.append(f"waited {row['wait_fraction']:.0%} of its time for a busy core")
-        if row["overrun"] is not None and row["overrun"] > LATE:
-            said.append(f"took {row['overrun']:.0%} more time than its budget")
-        if row["noise_floor"] and row["l1"] < NEAR_FLOOR * row["noise_floor"]:
-            said.append(f"its L1 error is only {row['l1'] / row['noise_floor']:.2g} times the reference's noise, a part of it")
-        if row["worst_speed_up"] is not None and row["worst_speed_up"] < SLOWER:
-            said.append(f"{row['worst_speed_up']:.2g}x as fast as the baseline to the L1 error where it compares worst")
+        said += advice.sentences(row)
         if row["apart"] > APART:
             said.append(f"its mean image is {row['apart']:.0f} standard errors from the baseline's: one of the two is biased, or "
                         "has too few samples to know its error")
