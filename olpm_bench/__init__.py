@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+__version__ = "0.1.0"
+
 try:
     import representations  # noqa: F401  (points Dr.Jit at a libLLVM that works, before the first `import drjit`)
 except ImportError as error:

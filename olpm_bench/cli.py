@@ -15,7 +15,9 @@ from typing import Annotated, Any
 
 import typer
 
+from olpm_bench import __version__, shipped
 from olpm_bench.bench.terminal import one_line
+from olpm_bench.examples import epilog
 from olpm_bench.transport.settings import InputError
 from representations import RepresentationError
 from representations._llvm import LLVMError
@@ -26,9 +28,10 @@ RESUMED = ("run", "submit", "gate", "reference")
 MAX_SEED = 2**15 - 1        # of cells: `config.MAX_SEED`, whose import would take a second of every --help
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
-                  help="Which learnt directional distribution guides a path tracer best?")
+                  epilog=epilog())
 
-ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", show_default=False)]
+ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT", show_default=False,
+                                                help="A TOML, or the name of an experiment that comes with olpm-bench.")]
 ResultsFolder = Annotated[Path, typer.Option(
     "--results", metavar="DIR", help="Results go to DIR/<stem of the TOML>, references to DIR/references.")]
 Replacements = Annotated[list[str], typer.Option(
@@ -38,6 +41,18 @@ Scale = Annotated[str | None, typer.Option(
 Only = Annotated[list[str], typer.Option("--only-scene", metavar="NAME", help="Leave the other scenes for later.")]
 Assignments = Annotated[list[str], typer.Option(
     "--set", metavar="TABLE.KEY=VALUE", help="Change a setting; keys as in the TOML.")]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"olpm-bench {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_show_version,
+                                                  help="Show the version, and exit.")] = False) -> None:
+    """Which learnt directional distribution guides a path tracer best?"""
 
 
 def complain(message: str) -> None:
@@ -83,7 +98,8 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
-    return app.command(body.__name__.strip("_"))(run)
+    name = body.__name__.strip("_")
+    return app.command(name, epilog=epilog(name))(run)
 
 
 def _interrupt(signum: int, frame: object) -> None:
@@ -106,7 +122,7 @@ def _load(path: Path, replacements: list[str] | None = None, scale: str | None =
     """The experiment, at a scale of its own if one is named, with `NAME=PATH` options applied."""
     from olpm_bench.bench import experiment_file
 
-    scenes = _replacements(replacements)
+    path, scenes = shipped.experiment_file(path), _replacements(replacements)
     if path.is_file() and ".py:" in path.read_text(encoding="utf-8", errors="replace"):
         from olpm_bench.bench import environment
 
@@ -129,7 +145,10 @@ def _load_run(source: Path, results: Path, replacements: list[str] | None, scale
 def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
         only: Only = [],  # noqa: B006
         scale: Scale = None,
-        dry_run: Annotated[bool, typer.Option("--dry-run", help="Print cells, hours and memory; run nothing.")] = False,
+        dry_run: Annotated[bool, typer.Option("--dry-run", help="Print cells, hours, memory, and what would be refused; run "
+                                                                "nothing.")] = False,
+        with_reference: Annotated[bool, typer.Option("--with-reference", help="First make the references that are missing.")]
+        = False,
         shard: Annotated[str, typer.Option(metavar="I/N", help="Run a part of the cells, and leave the others to other machines "
                                                                "that share the folder: 1/N to N/N.")] = "1/1",
         ) -> None:
@@ -138,18 +157,21 @@ def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), sc
 
     loaded = _load(experiment, scene, scale)
     environment.select_variant()
+    from olpm_bench.bench import plan as planning
+    from olpm_bench.bench import reference as references
     from olpm_bench.bench import run as runner
     from olpm_bench.bench.shard import WHOLE, Shard
 
     part = Shard.parse(shard)
     if dry_run:
-        plan = runner.plan(loaded.of_scenes(only), results, part)
-        hours = "unknown" if plan["hours"] is None else f"{plan['hours']:.2f}, and compilation"
-        for spec in plan["cells"]:
-            print(f"{spec}{'' if spec in plan['todo'] else '  (complete)'}")
-        print(f"{len(plan['todo'])} of {len(plan['cells'])} cells to run; hours: {hours}; "
-              f"memory: about {plan['gigabytes']:.1f} GB")
-        return
+        found = planning.plan(loaded.of_scenes(only), results, part, with_reference)
+        for line in planning.lines(found):
+            print(line)
+        for refusal in found.refusals:
+            complain(refusal)
+        raise typer.Exit(BAD_INPUT if found.refusals else 0)
+    if with_reference:
+        references.make(loaded.of_scenes(only), results)
     problems = runner.run(loaded, results, only, part)
     if problems:
         for problem in problems:
@@ -157,7 +179,7 @@ def run(experiment: ExperimentFile, results: ResultsFolder = Path("results"), sc
         cells = part.of(loaded.of_scenes(only).cells())
         complain(f"{len(problems)} of {len(cells)} cells are not complete; no table and no figures")
         raise typer.Exit(FAILED)
-    if part != WHOLE and (left := runner.plan(loaded.of_scenes(only), results)["todo"]):
+    if part != WHOLE and (left := planning.plan(loaded.of_scenes(only), results).todo):
         print(f"shard {part} is complete; no table and no figures yet: {len(left)} cells of other shards are missing")
         return
     runner.report(loaded, results, only)
@@ -182,6 +204,7 @@ def submit(experiment: ExperimentFile, results: ResultsFolder = Path("results"),
         from olpm_bench.bench import submit as submission
     except ModuleNotFoundError as error:
         raise InputError(f"submit needs {error.name}: pip install 'olpm-bench[cluster]'") from None
+    from olpm_bench.bench import plan as planning
     from olpm_bench.bench import run as runner
     from olpm_bench.bench.results import Results
 
@@ -193,7 +216,7 @@ def submit(experiment: ExperimentFile, results: ResultsFolder = Path("results"),
               f"{loaded.command('run', results)}")
         return
     submission.wait(jobs, loaded, results)
-    if left := runner.plan(loaded, results)["todo"]:
+    if left := planning.plan(loaded, results).todo:
         stored = Results(results / loaded.stem)
         for spec in left:
             failure = stored.failure(spec.scene.name, spec.method.name, spec.seed)
@@ -247,7 +270,9 @@ def gate(experiment: ExperimentFile, results: ResultsFolder = Path("results"), s
 @command
 def reference(experiment: ExperimentFile, results: ResultsFolder = Path("results"), scene: Replacements = [],  # noqa: B006
               scale: Scale = None,
-              seconds: Annotated[float, typer.Option(min=1.0, help="Charged seconds for each scene.")] = 300.0) -> None:
+              seconds: Annotated[float | None, typer.Option(
+                  min=1.0, help="Charged seconds for each scene; by default 300, or 25 times a cell's budget if that is more.",
+                  show_default=False)] = None) -> None:
     """Make or improve the references of an experiment: two unguided halves, resumable."""
     from olpm_bench.bench import environment
 
@@ -255,7 +280,7 @@ def reference(experiment: ExperimentFile, results: ResultsFolder = Path("results
     environment.select_variant()
     from olpm_bench.bench import reference as references
 
-    if not references.improve(loaded, results, seconds):
+    if not references.improve(loaded, results, seconds or references.seconds_for(loaded)):
         print(f"nothing to make: each scene of {experiment.name} names its reference or does without")
 
 
@@ -446,29 +471,21 @@ def perf(scene: Annotated[str, typer.Option(metavar="NAME|FILE.xml", help="What 
 
 @command
 def list_() -> None:
-    """Show scenes, representations and experiments."""
-    import tomllib
+    """Show scenes, representations with their parameters (name, type, default), and experiments."""
+    from olpm_bench.bench import listing
 
-    import representations
-    from olpm_bench import scenes
+    for line in listing.lines():
+        print(line)
 
-    print("Scenes")
-    for name, description in scenes.names().items():
-        given = ", ".join(f"{k} = {v}" for k, v in scenes.parameters(name).items())
-        print(f"  {name}: {description}{f'  ({given})' if given else ''}")
-    print("  or any Mitsuba XML\nRepresentations")
-    for name in representations.names():
-        print(f"  {name}")
-    print("  or path/to/file.py:ClassName\nExperiments")
-    files = sorted(Path("experiments").glob("*.toml"))
-    for file in files:
-        try:
-            title = tomllib.loads(file.read_text(encoding="utf-8")).get("title", "")
-        except (OSError, ValueError, RecursionError) as error:
-            title = f"cannot be read: {error}"
-        print(one_line(f"  {file}: {title}"))
-    if not files:
-        print("  none in ./experiments")
+
+@command
+def new(kind: Annotated[str, typer.Argument(metavar="experiment|representation", show_default=False)],
+        name: Annotated[str, typer.Argument(metavar="NAME", show_default=False)]) -> None:
+    """Write NAME.toml or NAME.py: an experiment, or a representation, that runs as it is and explains itself."""
+    from olpm_bench.bench import new as beginning
+
+    path = beginning.new(kind, name)
+    print(f"wrote {path}; next: {beginning.next_step(kind, path)}")
 
 
 def main() -> None:

@@ -11,16 +11,19 @@ satisfies :class:`representations.interface.DirectionalPdf` and is found in one 
 """
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.metadata
 import importlib.util
 import inspect
 import sys
+from collections.abc import Mapping
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
 from representations import _llvm
+from representations.suggest import closest
 
 _llvm.select()          # before the first `import drjit` of the process
 
@@ -64,7 +67,8 @@ def find(name: str) -> Any:
             raise RepresentationError(f"representation '{name}', entry point {entry.value}, {_reason(error)}") from error
     if (found := file_of(name)) is not None:
         return _from_file(*found)
-    raise RepresentationError(f"unknown representation '{name}'; known: {', '.join(names())}, or path/to/file.py:ClassName")
+    raise RepresentationError(f"unknown representation '{name}'; known: {', '.join(names())}, or path/to/file.py:ClassName"
+                              + closest(name, names()))
 
 
 def create(type: str, **parameters: Any) -> Any:
@@ -75,13 +79,17 @@ def create(type: str, **parameters: Any) -> Any:
     Raises:
         RepresentationError: unknown name; unknown, missing or invalid hyper-parameter; code of others that fails.
     """
-    cls = find(type)
+    return instance(find(type), type, parameters)
+
+
+def instance(cls: Any, type: str, parameters: dict[str, Any]) -> Any:
+    """As :func:`create`, of a class that :func:`find` has found by the name `type`."""
     try:
-        known = inspect.signature(cls).parameters
+        known = parameters_of(cls)
         for key, value in parameters.items():
             if key not in known:
                 raise RepresentationError(f"representation '{type}' has no parameter '{key}'; "
-                                          f"known: {', '.join(known) or 'none'}")
+                                          f"known: {', '.join(known) or 'none'}{closest(key, known)}")
             if (allowed := wrong_type(value, known[key].default)) is not None:
                 raise RepresentationError(f"representation '{type}': {key} = {value!r}: must be {allowed}")
         return cls(**parameters)
@@ -95,8 +103,16 @@ def create(type: str, **parameters: Any) -> Any:
         raise RepresentationError(f"representation '{type}' {_reason(error)}") from error
 
 
+@functools.cache
+def parameters_of(cls: Any) -> Mapping[str, inspect.Parameter]:
+    """The hyper-parameters of a class, by name."""
+    return inspect.signature(cls).parameters
+
+
 def wrong_type(value: Any, default: Any) -> str | None:
     """What a parameter with this default must be, if `value` is not; None also where the default doesn't tell."""
+    if type(value) is type(default):
+        return None
     if isinstance(default, bool):
         return None if isinstance(value, bool) else "true or false"
     if isinstance(default, int):

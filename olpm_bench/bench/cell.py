@@ -17,11 +17,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from olpm_bench.bench import environment, probe
+from olpm_bench.bench import environment, metrics, probe
 from olpm_bench.bench.accumulator import Accumulator
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec
-from olpm_bench.bench.metrics import luminance
 from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.settings import TrainingSettings
@@ -266,7 +265,7 @@ class _Cell:
         image = to_numpy(rendered)
         check_pixels(image, source)
         self.image.add(image, spp)
-        self.brightness.add(np.mean(luminance(image)), spp)
+        self.brightness.add(np.full((1, 1, 1), metrics.mean(image)), spp)
 
     def checkpoint(self, guide: Guide | None) -> None:
         """Keep the image, if it is time to."""

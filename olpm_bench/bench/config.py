@@ -9,11 +9,12 @@ import dataclasses
 import functools
 import hashlib
 import importlib.metadata
-import inspect
+import itertools
 import json
 import os
 import shlex
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,10 +24,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, 
 
 import representations
 from olpm_bench import scenes as embedded
-from olpm_bench import transport
+from olpm_bench import shipped, transport
 from olpm_bench.bench import environment
 from olpm_bench.bench.files import SCHEMA_VERSION, slug
 from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
+from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes
 
 LEAST_SECONDS = 1e-3        # of a budget: a pass takes longer
@@ -131,8 +133,15 @@ class Scene(Table):
         return dict(self.overrides) if self.file is not None else embedded.resolve(self.name, self.parameters)
 
     def digest(self) -> str:
-        """Hash of all that determines the scene's radiance."""
-        return embedded.digest(self.file or self.name, self.arguments)
+        """Hash of all that determines the scene's radiance; its files are read once, for all cells and references of it."""
+        what = json.dumps([self.source, self.arguments], sort_keys=True, default=str)
+        if what not in self._digests:
+            self._digests[what] = embedded.digest(self.file or self.name, self.arguments)
+        return self._digests[what]
+
+    @functools.cached_property
+    def _digests(self) -> dict[str, str]:
+        return {}
 
 
 class Series(Table):
@@ -158,12 +167,14 @@ class Method(Table):
     representation: ``{ type = name, ...hyper-parameters }``; none traces unguided.
     integrator, training: what differs from the experiment's own tables.
     series: of a method that a ``sweep`` has made, see :mod:`olpm_bench.bench.sweep`.
+    look: number of its colour, marker and dash in figures; by default its place among the methods, also at scales with fewer.
     """
     name: Label = Field(min_length=1)
     representation: dict[str, Any] | None = None
     integrator: dict[str, Any] = {}
     training: dict[str, Any] = {}
     series: Series | None = None
+    look: int | None = Field(None, ge=0, lt=1000)
 
     @model_validator(mode="after")
     def _sensible(self) -> Method:
@@ -210,7 +221,7 @@ class Claim(Table):
     @classmethod
     def _known(cls, value: str) -> str:
         if value not in (known := [*METRICS, *OVER_SEEDS]):
-            raise ValueError(f"must be one of {', '.join(known)}")
+            raise ValueError(f"must be one of {', '.join(known)}{closest(value, known)}")
         return value
 
 
@@ -289,7 +300,7 @@ class Experiment(Table):
         """The command `name` of this experiment, for a shell; `root` is the `--results` folder."""
         scale = ["--scale", self._scale] if self._scale is not None else []
         scenes = [f"--scene={scene}={file}" for scene, file in self._scenes.items()]
-        return shlex.join(["olpm-bench", name, str(self.path), *scale, "--results", str(root), *scenes])
+        return shlex.join(["olpm-bench", name, shipped.named(self.path), *scale, "--results", str(root), *scenes])
 
     @field_validator("schema_version")
     @classmethod
@@ -318,24 +329,28 @@ class Experiment(Table):
     def _distinct(self) -> Experiment:
         for kind, names in (("methods", [m.name for m in self.method]), ("scenes", [s.name for s in self.scene])):
             folders: dict[str, str] = {}
+            count = Counter(names)
             for name in names:
                 other = folders.setdefault(slug(name).lower(), name)
-                if names.count(name) > 1:
+                if count[name] > 1:
                     raise ValueError(f"two {kind} of one name {name!r}; names must differ")
                 if other != name:
                     raise ValueError(f"{kind} {other!r} and {name!r} would share the folder '{slug(name)}', at least where "
                                      "upper case is lower case; names must differ")
         if self.baseline_name not in (known := [m.name for m in self.method]):
-            raise ValueError(f"baseline = {self.baseline!r}: no method of this name; known: {', '.join(known)}")
+            raise ValueError(f"baseline = {self.baseline!r}: no method of this name; known: {', '.join(known)}"
+                             + closest(self.baseline_name, known))
         for number, claim in enumerate(self.claim, 1):
             for key, name in (("better", claim.better), ("worse", claim.worse)):
                 if name not in known:
-                    raise ValueError(f"[[claim]] {number}: {key} = {name!r}: no method of this name; known: {', '.join(known)}")
+                    raise ValueError(f"[[claim]] {number}: {key} = {name!r}: no method of this name; known: {', '.join(known)}"
+                                     + closest(name, known))
             if claim.better == claim.worse:
                 raise ValueError(f"[[claim]] {number}: {claim.better!r} is compared with itself")
+        depths = {scene.max_depth: scene for scene in self.scene}       # all that a scene changes of a method's settings
         for method in self.method:
             self.training_of(method)
-            for scene in self.scene:
+            for scene in depths.values():
                 self.integrator_of(scene, method)
         return self
 
@@ -356,10 +371,18 @@ class Experiment(Table):
 
         The methods of a sweep share one where there are too many to tell apart.  As a curve, a sweep looks as its last method.
         """
-        alike = {m.name: m.series.name if m.series is not None and len(self.method) > LOOKS else m.name for m in self.method}
-        numbers = {name: number for number, name in enumerate(dict.fromkeys(alike.values()))}
-        methods = {name: numbers[look] for name, look in alike.items()}
-        return methods | {m.series.name: methods[m.name] for m in self.method if m.series is not None}
+        return looks_of([(m.name, None if m.series is None else m.series.name, m.look) for m in self.method])
+
+    def looking_as(self, known: Mapping[str, int]) -> Experiment:
+        """The experiment whose methods have the looks that are known of their names, and others have looks that are free."""
+        now, taken, wanted = self.looks, set(known.values()), {}
+        free = (number for number in itertools.count() if number not in taken)
+        for m in self.method:
+            shared = m.series.name if m.series is not None and len(self.method) > LOOKS else m.name
+            wanted[m.name] = known[m.name] if m.name in known else known[shared] if shared in known else next(free)
+        if all(now[name] == look for name, look in wanted.items()):
+            return self
+        return self.model_copy(update={"method": [m.model_copy(update={"look": wanted[m.name]}) for m in self.method]})
 
     def integrator_of(self, scene: Scene, method: Method) -> IntegratorSettings:
         changes = dict(method.integrator)
@@ -382,8 +405,14 @@ class Experiment(Table):
     def cells(self) -> list[CellSpec]:
         """Every cell in the order of running: methods innermost, so that they share the machine's good and bad
         hours."""
-        return [CellSpec(scene, method, seed, self.integrator_of(scene, method), self.training_of(method), self.budget)
-                for scene in self.scene for seed in self.seeds for method in self.method]
+        cells = []
+        trainings = [self.training_of(method) for method in self.method]
+        for scene in self.scene:
+            integrators = [self.integrator_of(scene, method) for method in self.method]
+            settings = list(zip(self.method, integrators, trainings, strict=True))
+            cells += [CellSpec(scene, method, seed, integrator, training, self.budget)
+                      for seed in self.seeds for method, integrator, training in settings]
+        return cells
 
     def of_scenes(self, names: Sequence[str]) -> Experiment:
         """The experiment with some of its scenes only; with all of them if none is named.
@@ -394,13 +423,13 @@ class Experiment(Table):
         known = [scene.name for scene in self.scene]
         for name in names:
             if name not in known:
-                raise ConfigError(f"no scene {name!r} in {self.path.name}; known: {', '.join(known)}")
+                raise ConfigError(f"no scene {name!r} in {self.path.name}; known: {', '.join(known)}{closest(name, known)}")
         return self.model_copy(update={"scene": [scene for scene in self.scene if not names or scene.name in names]})
 
     def of_results(self, folder: Path) -> Experiment:
         """The experiment that was read from its results, under the name of the file that they were made from."""
         named, (stem, _, scale) = self.model_copy(), folder.name.rpartition("-")
-        original, scaled = (Path("experiments") / f"{name}.toml" for name in (folder.name, stem))
+        original, scaled = (shipped.experiment_file(Path("experiments") / f"{name}.toml") for name in (folder.name, stem))
         if scaled.is_file() and not original.is_file():
             named._path, named._scale = scaled, scale
         else:
@@ -442,6 +471,8 @@ class Experiment(Table):
             table["integrator"] = {k: v for k, v in integrator.items() if k != "max_depth"}
             if method.series is not None:
                 table["series"] = method.series.model_dump()
+            if method.look is not None:
+                table["look"] = method.look
             methods.append(table)
         return {
             "schema_version": SCHEMA_VERSION, "title": self.title, "description": self.description, "seeds": self.seeds,
@@ -455,6 +486,18 @@ class Experiment(Table):
         return tomli_w.dumps(_without_none(self.resolved(relative_to)))
 
 
+def looks_of(methods: Sequence[tuple[str, str | None, int | None]]) -> dict[str, int]:
+    """Name of a method or of a sweep -> number of its look, see `Experiment.looks`.
+
+    Args:
+        methods: their names, those of their sweeps, and the looks that they ask for.
+    """
+    alike = {name: series if series is not None and len(methods) > LOOKS else name for name, series, _ in methods}
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(alike.values()))}
+    found = {name: numbers[alike[name]] if look is None else look for name, _, look in methods}
+    return found | {series: found[name] for name, series, _ in methods if series is not None}
+
+
 def reference_key(scene: Scene, max_depth: int) -> str:
     """Folder of a scene's reference: readable, and different whenever the converged image may differ."""
     digest = _hash({"scene": scene.digest(), "width": scene.width, "height": scene.height, "max_depth": max_depth})
@@ -465,10 +508,19 @@ def _representation_defaults(method: Method) -> dict[str, Any] | None:
     """The representation's table with every hyper-parameter."""
     if method.representation is None:
         return None
-    signature = inspect.signature(representations.find(method.representation["type"]))
-    defaults = {name: p.default for name, p in signature.parameters.items()
-                if isinstance(p.default, (bool, int, float, str, list))}
-    return {**defaults, **method.representation}
+    return {**_defaults(method.representation["type"], _representation_code(method)), **method.representation}
+
+
+@functools.cache
+def _defaults(representation: str, code: str | None) -> dict[str, Any]:
+    """The hyper-parameters of a representation; found once for all methods that have it, as long as its file stays as it is.
+
+    Args:
+        code: hash of that file, if it has one.
+    """
+    parameters = representations.parameters_of(representations.find(representation))
+    return {name: p.default for name, p in parameters.items()
+            if isinstance(p.default, (bool, int, float, str, list))}
 
 
 def _without_none(value: Any) -> Any:

@@ -11,6 +11,7 @@ import json
 import shlex
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,22 @@ from pydantic import BaseModel, ValidationError
 
 import representations
 from olpm_bench import scenes as embedded
-from olpm_bench.bench.config import NO_REFERENCE, Budget, Claim, ConfigError, Experiment, Method, Scene, SweepFigure
+from olpm_bench import shipped
+from olpm_bench.bench.config import (
+    NO_REFERENCE,
+    Budget,
+    Claim,
+    ConfigError,
+    Experiment,
+    Method,
+    Scene,
+    SweepFigure,
+    looks_of,
+)
 from olpm_bench.bench.scale import scaled
 from olpm_bench.bench.sweep import expanded
 from olpm_bench.bench.terminal import one_line
+from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, preset_of
 
 TABLES = {"budget": Budget, "scene": Scene, "method": Method, "claim": Claim, "sweep": SweepFigure,
@@ -51,7 +64,7 @@ def load(path: Path | str, scenes: dict[str, Path] | None = None, scale: str | N
             raise OSError("no regular file")        # some never end
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"experiment file {path}: there is no such file") from None
+        raise ConfigError(f"experiment file {path}: there is no such file{closest(path.stem, shipped.experiments())}") from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"experiment file {path}: cannot be read: {error}") from None
     try:
@@ -60,15 +73,31 @@ def load(path: Path | str, scenes: dict[str, Path] | None = None, scale: str | N
         raise ConfigError(f"{path.name} is not valid TOML: {error}") from None
     except RecursionError:
         raise ConfigError(f"{path.name} {TOO_DEEP}") from None
-    source = path.name
+    source, whole = path.name, data
     if scale is not None:
         try:
             data, source = scaled(data, scale, source), f"{source} --scale {scale}"
         except InputError as error:
             raise ConfigError(str(error)) from None
     experiment = parse(data, source, path.parent, scenes or {})
+    if scale is not None:
+        experiment = experiment.looking_as(_looks(whole))
     experiment._path, experiment._scale, experiment._scenes = path, scale, dict(scenes or {})
     return experiment
+
+
+def _looks(whole: dict[str, Any]) -> dict[str, int]:
+    """How the methods of a file look at its full scale, as far as that is right there."""
+    try:
+        methods = list(_tables(_without_sweeps(whole).get("method")))
+    except InputError:
+        return {}
+    named = []
+    for method in methods:
+        series, look = method.get("series"), method.get("look")
+        named.append((str(method.get("name")), str(series.get("name")) if isinstance(series, dict) else None,
+                      look if isinstance(look, int) else None))
+    return looks_of(named)
 
 
 def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Path] | None = None) -> Experiment:
@@ -96,19 +125,24 @@ def parse(data: dict[str, Any], source: str, folder: Path, scenes: dict[str, Pat
         raise ConfigError(f"{source} {TOO_DEEP}") from None
     for scene in experiment.scene:
         _check_scene(scene, source, replaceable=scenes is not None)
+    classes: dict[str, Any] = {}            # a sweep has one class: its file is run once
     for method in experiment.method:
-        announce(method.representation_name)
+        if (name := method.representation_name) is None:
+            continue
+        announce(name)
         try:
-            method.create()
+            if name not in classes:
+                classes[name] = representations.find(name)
+            representations.instance(classes[name], name, method.representation_parameters)
         except representations.RepresentationError as error:
             raise ConfigError(f"{source} [[method]] {method.name!r}: {error}") from None
     return experiment
 
 
 @functools.cache
-def announce(representation: str | None) -> None:
+def announce(representation: str) -> None:
     """Say on the terminal, once, that code is run which is not ours: that of FILE.py:Class."""
-    found = representations.file_of(representation or "")
+    found = representations.file_of(representation)
     if found is not None and found[0].is_file():
         print(one_line(f"olpm-bench: runs the code of {found[0]}"), file=sys.stderr)
 
@@ -149,7 +183,7 @@ def _replace_scenes(data: dict[str, Any], scenes: dict[str, Path], source: str) 
     for name, file in scenes.items():
         if name not in known:
             raise ConfigError(f"--scene {name}={file}: no scene '{name}' in {source}; "
-                              f"known: {', '.join(known)}")
+                              f"known: {', '.join(known)}{closest(name, known)}")
         known[name]["file"] = str(Path(file).resolve())
 
 
@@ -164,7 +198,8 @@ def _check_scene(scene: Scene, source: str, replaceable: bool) -> None:
     else:
         known = embedded.names()
         if scene.name not in known:
-            raise ConfigError(f"{where}: unknown scene; known: {', '.join(known)}, or give file = \"scene.xml\"")
+            raise ConfigError(f"{where}: unknown scene; known: {', '.join(known)}, or give file = \"scene.xml\""
+                              + closest(scene.name, known))
         if scene.overrides:
             raise ConfigError(f"{where}: overrides belong to files; an embedded scene takes parameters")
         try:
@@ -184,9 +219,9 @@ def _without_sweeps(data: dict[str, Any]) -> dict[str, Any]:
     methods = data.get("method")
     if not isinstance(methods, list):
         return data
-    names = [method.get("name") for method in _tables(methods)]
+    count = Counter(repr(method.get("name")) for method in _tables(methods))
     for method in _tables(methods):
-        if "sweep" in method and names.count(method.get("name")) > 1:
+        if "sweep" in method and count[repr(method.get("name"))] > 1:
             raise InputError(f"two methods of one name {method.get('name')!r}; names must differ")
     return data | {"method": [m for method in methods for m in (expanded(method) if isinstance(method, dict) else [method])]}
 
@@ -252,7 +287,7 @@ def _explain(error: ValidationError, source: str) -> str:
             known.insert(0, "preset")
         if cls is Method:
             known.append("sweep")
-        return f"unknown key '{keys[-1]}' in {where}; known: {', '.join(known)}"
+        return f"unknown key '{keys[-1]}' in {where}; known: {', '.join(known)}{closest(str(keys[-1]), known)}"
     if first["type"] in ("missing", "missing_argument"):
         return f"missing key '{keys[-1]}' in {where}" if keys else f"missing table '{table}' in {source}"
     if not keys and table is not None and not isinstance(first["input"], dict):     # the table itself is none

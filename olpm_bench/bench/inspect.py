@@ -28,6 +28,7 @@ from olpm_bench.bench.results import Results
 from olpm_bench.bench.run import require_memory
 from olpm_bench.report import figures, landings, records
 from olpm_bench.report import inspect as picture
+from olpm_bench.suggest import closest
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.gather import GATHERS, Gathered, binned
 from olpm_bench.transport.guide import MIN_PARTICLES, Guide
@@ -75,10 +76,11 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
     specs = _specs(experiment, scene, methods, experiment.seeds[0] if seed is None else seed)
     guided = [spec for spec in specs if spec.training is not None]
     files, name = dict(guides or {}), specs[0].scene.name
+    known = [spec.method.name for spec in guided]
     for method in files:
-        if method not in [spec.method.name for spec in guided]:
+        if method not in known:
             raise ConfigError(f"--guide {method}={files[method]}: no method {method!r} with a guide; "
-                              f"known: {', '.join(spec.method.name for spec in guided)}")
+                              f"known: {', '.join(known)}{closest(method, known)}")
     require_memory([spec for spec in guided if spec.method.name not in files])
     loaded = cells.load_scene(specs[0])
     vertices = {pixel: _vertex(loaded, pixel, specs[0].integrator.max_depth, number, path_seed) for pixel in pixels}
@@ -103,7 +105,8 @@ def inspect(experiment: Experiment, folder: Path, pixels: Sequence[tuple[int, in
         for index, (pixel, at) in enumerate(vertices.items()):
             truth = vertex.truth(loaded, at, specs[0].integrator, best, passes, seed=path_seed,
                                  on_pass=progress(len(guided) + index, f"truth at {pixel[0]},{pixel[1]}"))
-            columns = [_column(loaded, spec, at, truth, learnt.get(spec.method.name)) for spec in specs]
+            columns = [_column(loaded, spec, experiment.looks[spec.method.name], at, truth, learnt.get(spec.method.name))
+                       for spec in specs]
             title = f"{name}, pixel {pixel[0]},{pixel[1]}: vertex {at.number}, on {at.shape}"
             bar.say(f"{title}; noise of a sample: {', '.join(f'{c.name} {c.sampled.deviation:.2f}' for c in columns)}")
             written += _write(picture.Page(title, image, shown, pixel, at, truth, columns, last), folder / "inspect", specs[0])
@@ -115,9 +118,11 @@ def _specs(experiment: Experiment, scene: str | None, methods: Sequence[str], se
     if scene is None and len(experiment.scene) > 1:
         raise ConfigError(f"{experiment.path}: which scene? --scene NAME, one of "
                           f"{', '.join(s.name for s in experiment.scene)}")
-    if unknown := set(methods) - {method.name for method in experiment.method}:
-        raise ConfigError(f"--method {sorted(unknown)[0]}: no such method in {experiment.path}; known: "
-                          f"{', '.join(method.name for method in experiment.method)}")
+    known = [method.name for method in experiment.method]
+    for method in methods:
+        if method not in known:
+            raise ConfigError(f"--method {method}: no such method in {experiment.path}; known: {', '.join(known)}"
+                              + closest(method, known))
     shown = methods or [method.name for method in experiment.shown]
     cells = experiment.of_scenes([scene] if scene else []).model_copy(update={"seeds": [seed]}).cells()
     return [spec for spec in cells if spec.method.name in shown]
@@ -243,13 +248,14 @@ def _by_room(learnt: Mapping[str, Learnt], rooms: Sequence[str], out: Path, scen
     return written
 
 
-def _column(scene: mi.Scene, spec: CellSpec, at: vertex.Vertex, truth: vertex.Truth, learnt: Learnt | None) -> picture.Column:
+def _column(scene: mi.Scene, spec: CellSpec, look: int, at: vertex.Vertex, truth: vertex.Truth,
+            learnt: Learnt | None) -> picture.Column:
     density = vertex.density(scene, at, learnt.guide if learnt else None, spec.integrator.fraction, truth.bins)
     particles = {}
     if learnt is not None and density.record is not None:
         particles = {kind: vertex.particles(batch, learnt.guide, at, density.record) for kind, batch in learnt.batches.items()}
     return picture.Column(
-        spec.method.name, density, vertex.fit(truth.incident, density.guide) if density.guide is not None else None,
+        spec.method.name, look, density, vertex.fit(truth.incident, density.guide) if density.guide is not None else None,
         vertex.fit(truth.reflected, density.mixture), particles)
 
 

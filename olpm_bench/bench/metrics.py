@@ -24,6 +24,12 @@ def _luminance_weights() -> np.ndarray:
     return weights
 
 
+def mean(image: np.ndarray) -> float:
+    """Mean over pixels and channels (h, w, 3), by which images are told apart: the weights of the errors here, and of the
+    page's viewer."""
+    return float(np.mean(image, dtype=np.float64))
+
+
 def luminance(image: np.ndarray) -> np.ndarray:
     """Rec. 709 luminance of linear RGB: (..., 3) -> (...), float64."""
     return image.astype(np.float64) @ _luminance_weights()

@@ -17,16 +17,18 @@ from olpm_bench.bench import cell, environment
 from olpm_bench.bench.accumulator import Accumulator
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec, Experiment
-from olpm_bench.bench.files import ResultError, require_inside
+from olpm_bench.bench.files import ResultError, read_json, require_inside
 from olpm_bench.bench.lock import locked
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.reference_file import Reference, find_reference, read_reference, write_reference
-from olpm_bench.bench.run import reference_folders
+from olpm_bench.bench.run import reference_folders, reference_of
 from olpm_bench.transport import headroom
 
 ESTIMATOR = "path, unguided"
 SAVE_SECONDS = 30.0
 PASS_SECONDS = 1.0
+LEAST_SECONDS = 300.0           # of a reference
+TIMES_BUDGET = 25               # charged seconds of a reference over those of a cell: a fifth of its error, if that is unguided
 SEEDS = {"a": 2**31, "b": 2**31 + 2**30}        # cells stay below 2^30
 
 
@@ -71,6 +73,44 @@ class Halves:
         return float(error / brightness) if brightness > 0 else float("inf")
 
 
+def seconds_for(experiment: Experiment) -> float:
+    """Charged seconds that a reference of this experiment takes where nobody says how many."""
+    return max(LEAST_SECONDS, TIMES_BUDGET * (experiment.budget.seconds or 0.0))
+
+
+def to_make(experiment: Experiment, root: Path) -> dict[str, float]:
+    """Scene name -> charged seconds that its reference still takes, of those that are missing or were interrupted.
+
+    Raises:
+        ResultError: a reference's meta.json is broken, or of a later version.
+    """
+    left = {}
+    for scene in experiment.scene:
+        if scene.reference is not None:
+            continue
+        found = reference_of(experiment, scene, root)
+        seconds = _left(found) if found is not None else seconds_for(experiment)
+        if seconds > 0:
+            left[scene.name] = seconds
+    return left
+
+
+def _left(folder: Path) -> float:
+    """Charged seconds that an interrupted reference was still to take; 0 if it was not interrupted."""
+    meta = read_json(folder / "meta.json")
+    return max(0.0, float(meta.get("wanted_seconds", 0.0)) - float(meta.get("seconds", 0.0)))
+
+
+def make(experiment: Experiment, root: Path) -> None:
+    """Make the references that `to_make` names, or go on with them.
+
+    Raises:
+        ResultError, SceneError, OSError: as `improve`.
+    """
+    for name, seconds in to_make(experiment, root).items():
+        improve(experiment.of_scenes([name]), root, seconds)
+
+
 def improve(experiment: Experiment, root: Path, seconds: float) -> dict[str, Path]:
     """Make, or go on with, the reference of every scene that does not name one.
 
@@ -106,6 +146,7 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
         integrator = mi.load_dict({"type": "path", "max_depth": experiment.max_depth(spec.scene), "rr_depth": 5})
         meta = {"key": key, "scene": spec.scene.name, "width": spec.scene.width, "height": spec.scene.height,
                 "max_depth": experiment.max_depth(spec.scene), "parameters": spec.scene.resolved_arguments(),
+                "wanted_seconds": halves.seconds + seconds,         # more than "seconds" if this is interrupted
                 "estimator": ESTIMATOR, "versions": environment.versions(), "commit": environment.commit()}
         spp = _spp_of_pass(spec, scene, integrator, seconds)
         clock, saved = Clock(count_wait=environment.uses_llvm()), time.monotonic()

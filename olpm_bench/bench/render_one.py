@@ -17,6 +17,7 @@ from olpm_bench.bench.files import check_writable, replacing
 from olpm_bench.bench.progress import Bar
 from olpm_bench.bench.run import require_memory
 from olpm_bench.report import records, tonemap
+from olpm_bench.suggest import closest
 from olpm_bench.transport.guide import MIN_PARTICLES, Guide
 from olpm_bench.transport.view import records_seen
 
@@ -36,7 +37,7 @@ def settings(assignments: list[str], tables: tuple[str, ...] = TABLES) -> dict[s
         if not equals or not dot or not key:
             raise ConfigError(f"--set {text}: must be TABLE.KEY=VALUE with a table of {', '.join(tables)}")
         if table not in found:
-            raise ConfigError(f"--set {text}: unknown table '{table}'; known: {', '.join(tables)}")
+            raise ConfigError(f"--set {text}: unknown table '{table}'; known: {', '.join(tables)}{closest(table, tables)}")
         if (table, key) == ("representation", "type"):
             raise ConfigError(f"--set {text}: the type is what --method (of `fit`: --representation) names")
         found[table][key] = parse_value(value.strip())

@@ -3,13 +3,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
 import representations
+from olpm_bench import shipped
 from olpm_bench.bench import environment
 from olpm_bench.bench.cell import CellFailedError, WarmUp, load_scene, measure, spp_of_pass, warm_up
 from olpm_bench.bench.clock import MAX_WAITED, UNRELIABLE
@@ -34,27 +35,29 @@ STORED, SPLIT = 52, 2
 GATHERED = {"binned": 50, "nearest": 130}
 
 
-def references(experiment: Experiment, root: Path) -> dict[str, Reference]:
+def references(experiment: Experiment, root: Path, without: Collection[str] = ()) -> dict[str, Reference]:
     """Scene name -> reference, of every scene that does not do without.
 
     Args:
         root: the `--results` folder.
+        without: names of scenes to leave out.
 
     Raises:
         ResultError: one is missing or broken; the message names the command that makes it.
     """
     found = {}
-    for scene in (scene for scene in experiment.scene if scene.has_reference):
-        path = scene.reference or _reference(experiment, scene, root)
+    for scene in (scene for scene in experiment.scene if scene.has_reference and scene.name not in without):
+        path = scene.reference or reference_of(experiment, scene, root)
         if path is None:
             raise ResultError(f"scene {scene.name} has no reference {experiment.reference_key(scene)}; make it with: "
-                              f"{experiment.command('reference', root)}, or do without: reference = \"none\"")
+                              f"{experiment.command('reference', root)}, or do without: reference = \"none\"; "
+                              "run --with-reference makes it, too")
         found[scene.name] = read_reference(path, scene.width, scene.height)
     return found
 
 
-def _reference(experiment: Experiment, scene: Scene, root: Path) -> Path | None:
-    """The scene's reference of this size, or of a multiple of it: that of the full scale serves a small one."""
+def reference_of(experiment: Experiment, scene: Scene, root: Path) -> Path | None:
+    """The scene's own reference of this size, or of a multiple of it: that of the full scale serves a small one."""
     for factor in range(1, LARGER + 1):
         larger = scene.model_copy(update={"width": factor * scene.width, "height": factor * scene.height})
         if found := find_reference(experiment.reference_key(larger), reference_folders(experiment, root)):
@@ -64,7 +67,8 @@ def _reference(experiment: Experiment, scene: Scene, root: Path) -> Path | None:
 
 def reference_folders(experiment: Experiment, root: Path) -> list[Path]:
     """Where references are looked for, in this order."""
-    return [root / "references", experiment.path.parent / ".." / "results" / "references", Path("results") / "references"]
+    return [root / "references", experiment.path.parent / ".." / "results" / "references", Path("results") / "references",
+            shipped.folder("references")]
 
 
 def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Shard = WHOLE, together: bool = False) -> list[str]:
@@ -86,8 +90,7 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
     results, part = Results(root / experiment.stem), experiment.of_scenes(only)
     references(part, root)                                  # before hours of work, not after
     cells = shard.first(part.cells()) if together else shard.of(part.cells())
-    for folder in (results.folder, *(results.cell_folder(c.scene.name, c.method.name, c.seed) for c in cells)):
-        require_inside(folder, root)
+    require_folders(results, cells, root)
     todo, problems = [], []
     for spec in cells:
         complete, why = is_complete(results, spec)
@@ -134,6 +137,15 @@ def run(experiment: Experiment, root: Path, only: Sequence[str] = (), shard: Sha
                 bar.say(f"[{index + 1}/{len(todo)}] {spec}: {info['spp']} spp in {info['charged_seconds']:.1f} s, "
                         f"{info['train_seconds']:.1f} s of it training{flag}")
     return problems
+
+
+def require_folders(results: Results, cells: Sequence[CellSpec], root: Path) -> None:
+    """
+    Raises:
+        ResultError: links lead out of the results folder.
+    """
+    for folder in (results.folder, *(results.cell_folder(c.scene.name, c.method.name, c.seed) for c in cells)):
+        require_inside(folder, root)
 
 
 def is_complete(results: Results, spec: CellSpec) -> tuple[bool, str]:
@@ -207,16 +219,6 @@ def _why(spec: CellSpec, error: Exception) -> str | None:
     return None
 
 
-def plan(experiment: Experiment, root: Path, shard: Shard = WHOLE) -> dict[str, Any]:
-    """What a run would do: cells, those to run, hours (None for a budget of samples), gigabytes of memory."""
-    results = Results(root / experiment.stem)
-    cells = shard.of(experiment.cells())
-    todo = [spec for spec in cells if not is_complete(results, spec)[0]]
-    seconds = [spec.budget.seconds for spec in todo]
-    return {"cells": cells, "todo": todo, "hours": sum(s for s in seconds if s) / 3600 if None not in seconds else None,
-            "gigabytes": max((memory(spec) for spec in cells), default=0.0)}
-
-
 def memory(spec: CellSpec) -> float:
     """Memory that a cell takes, at most [GB]: Mitsuba itself, paths in flight, particles and vertices of a pass, images."""
     pixels = spec.scene.width * spec.scene.height
@@ -238,10 +240,12 @@ def memory(spec: CellSpec) -> float:
 def require_memory(cells: Sequence[CellSpec]) -> None:
     """
     Raises:
-        InputError: one needs more than there is.
+        InputError: the one that needs most needs more than there is.
     """
-    for spec in cells:
-        headroom.require(1e9 * memory(spec), f"the paths, particles and images of {spec}",
+    if not cells:
+        return
+    needed, largest = max(((memory(spec), spec) for spec in cells), key=lambda found: found[0])
+    headroom.require(1e9 * needed, f"the paths, particles and images of {largest}",
                      "a smaller image, fewer photons, importons or checkpoints")
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError
 
 LEAST_CROP = 4          # pixels along a side of a crop that gets smaller with its image
@@ -28,7 +29,8 @@ def scaled(data: dict[str, Any], name: str, source: str) -> dict[str, Any]:
     scales = data.get("scale")
     known = scales if isinstance(scales, dict) else {}
     if not isinstance(known.get(name), dict):
-        raise InputError(f"--scale {name}: {source} has no [scale.{name}]; known: {', '.join(known) or 'none'}")
+        raise InputError(f"--scale {name}: {source} has no [scale.{name}]; known: {', '.join(known) or 'none'}"
+                         + closest(name, known))
     base = {**data, "title": f"{data['title']} ({name})"} if "title" in data else data
     return _laid_over(base, known[name], f"{source} [scale.{name}]")
 
@@ -44,7 +46,7 @@ def _laid_over(base: Any, change: Any, where: str) -> Any:
         known, named = {str(table.get("name")): table for table in base}, [str(table.get("name")) for table in change]
         for name in named:
             if name not in known:
-                raise InputError(f"{where}: none is named {name!r}; known: {', '.join(known)}")
+                raise InputError(f"{where}: none is named {name!r}; known: {', '.join(known)}{closest(name, known)}")
         return [_laid_over(known[name], table, where) for name, table in zip(named, change, strict=True)]
     return change
 

@@ -12,16 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import bias, gains, metrics, pixel_variance, statistics
+from olpm_bench.bench import advice, bias, gains, metrics, pixel_variance, statistics
 from olpm_bench.bench.bias import APART
 from olpm_bench.bench.clock import MAX_WAITED, UNRELIABLE
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
-from olpm_bench.bench.reference_file import NEAR_FLOOR
 from olpm_bench.bench.results import Cell, Results, warnings
 from olpm_bench.bench.terminal import plain_console
-
-LATE = 0.05                 # share of a budget in seconds by which a cell may exceed it, before that is said
-SLOWER = 0.95               # `worst_speed_up` below which that is said
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -66,8 +62,8 @@ def summarise(finished: Finished) -> dict[str, Any]:
     """The summary of an experiment: ``{"schema_version", "rows"}``, one row a scene and method, in the TOML's order.
 
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 %
-    quantiles, `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, and
-    `overrun` is the largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.
+    quantiles, `mean` is the mean of `metrics.mean` with its standard error, `compile_seconds` and `wait_fraction` are the
+    largest, and `overrun` is the largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.
     `work_normalised_variance` [s] and `gain` are those of :mod:`olpm_bench.bench.gains` by the median, with `_trimmed` and
     `_mean` by the means over pixels, each with its 90 % interval; `variance_passes` are the passes of all cells that they
     stand on, and `undefined` says which of them there are not and why.  `speed_up` is how many times as fast it is to
@@ -248,12 +244,7 @@ def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
                         "the time, so delete its cells and run it again on an idle machine")
         elif row["wait_fraction"] > MAX_WAITED:
             said.append(f"waited {row['wait_fraction']:.0%} of its time for a busy core")
-        if row["overrun"] is not None and row["overrun"] > LATE:
-            said.append(f"took {row['overrun']:.0%} more time than its budget")
-        if row["noise_floor"] and row["l1"] < NEAR_FLOOR * row["noise_floor"]:
-            said.append(f"its L1 error is only {row['l1'] / row['noise_floor']:.2g} times the reference's noise, a part of it")
-        if row["worst_speed_up"] is not None and row["worst_speed_up"] < SLOWER:
-            said.append(f"{row['worst_speed_up']:.2g}x as fast as the baseline to the L1 error where it compares worst")
+        said += advice.sentences(row)
         if row["apart"] > APART:
             said.append(f"its mean image is {row['apart']:.0f} standard errors from the baseline's, in the whole or in a "
                         "block: one of the two is biased, or has too few samples to know its error")

@@ -17,6 +17,7 @@ from olpm_bench.check import aiming, density, kernel, learning, many_records, me
 from olpm_bench.check.population import population, population_with_parallax
 from olpm_bench.check.trained import Trained
 from olpm_bench.check.verdict import Verdict, combined, sidak
+from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError
 
 LEVEL = 1e-4            # false alarms of a whole run
@@ -132,7 +133,7 @@ def named(names: Sequence[str]) -> list[Check]:
     known = {check.name: check for check in CHECKS}
     for name in names:
         if name not in known:
-            raise InputError(f"unknown check '{name}'; known: {', '.join(known)}")
+            raise InputError(f"unknown check '{name}'; known: {', '.join(known)}{closest(name, known)}")
     return [known[name] for name in names] or list(CHECKS)
 
 

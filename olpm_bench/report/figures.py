@@ -194,11 +194,17 @@ def style() -> AbstractContextManager[None]:
 
 
 def _look(number: int) -> dict[str, Any]:
-    """Colour, marker and dash, in the style that is active."""
+    """Colour, marker and dash, in the style that is active; where colours come again, it is with other markers and dashes."""
     from matplotlib import rcParams
 
     cycle = list(rcParams["axes.prop_cycle"])
-    return dict(cycle[number % len(cycle)])
+    round_, place = divmod(number, len(cycle))
+    return {**cycle[(place + round_) % len(cycle)], "color": cycle[place]["color"]}
+
+
+def colour(number: int) -> str:
+    """The colour of a look, in the style that is active."""
+    return str(_look(number)["color"])
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[str]:

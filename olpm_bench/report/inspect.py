@@ -5,7 +5,6 @@ up in the image.  Reads what :mod:`olpm_bench.bench.vertex` found, renders nothi
 """
 from __future__ import annotations
 
-import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench.vertex import Density, Fit, Truth, Vertex
-from olpm_bench.report import records, tonemap
+from olpm_bench.report import figures, records, tonemap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,11 +37,13 @@ GREY = "#555555"
 class Column:
     """One method.
 
+    look: number of its colour, as `Experiment.looks`.
     learnt: its record against the incident light; None without a record.
     sampled: the mixture of BSDF and record against the reflected light.
     particles: kind -> directions [n, 3] in the vertex's frame and weights [n].
     """
     name: str
+    look: int
     density: Density
     learnt: Fit | None
     sampled: Fit
@@ -68,7 +69,6 @@ class Page:
 
 def draw(page: Page) -> Figure:
     """The picture, in the style that is active."""
-    from matplotlib import rcParams
     from matplotlib.figure import Figure
 
     truths = [over_sphere(passes.mean(0)) for passes in (page.truth.incident, page.truth.reflected)]
@@ -97,8 +97,8 @@ def draw(page: Page) -> Figure:
         figure.text((LABEL - 0.1) / width, 1 - (head + line * row + DISK / 2) / height, text, rotation=90, ha="center",
                     va="center", fontsize=8.5)
     _where(page, place)
-    colours = itertools.chain(["#000000"], (style["color"] for style in itertools.cycle(rcParams["axes.prop_cycle"])))
-    for x, name, colour in zip(left, ("truth", *(c.name for c in page.columns)), colours, strict=False):
+    names = [("truth", "#000000"), *((c.name, figures.colour(c.look)) for c in page.columns)]
+    for x, (name, colour) in zip(left, names, strict=False):
         figure.text((x + DISK / 2) / width, 1 - (head - 0.06) / height, textwrap.fill(name, 22), ha="center", va="bottom",
                     fontsize=9, color=colour)
     for line, shown in enumerate(truths):

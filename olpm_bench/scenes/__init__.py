@@ -26,6 +26,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError
 
 LARGEST = 1e6           # parameter of an embedded scene
@@ -61,7 +62,8 @@ def resolve(name: str, changes: dict[str, Any] | None = None) -> dict[str, Any]:
     known = parameters(name)
     for key, value in (changes or {}).items():
         if key not in known:
-            raise SceneError(f"scene '{name}' has no parameter '{key}'; known: {', '.join(known) or 'none'}")
+            raise SceneError(f"scene '{name}' has no parameter '{key}'; known: {', '.join(known) or 'none'}"
+                             + closest(key, known))
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
             raise SceneError(f"scene '{name}', parameter {key} = {value!r}: must be a number, below {LARGEST:g}")
     values = {key: float((changes or {}).get(key, default)) for key, default in known.items()}
@@ -251,5 +253,6 @@ def _sha256(file: Path) -> str:
 
 def _module(name: str) -> ModuleType:
     if name not in EMBEDDED:
-        raise SceneError(f"unknown scene '{name}'; known: {', '.join(EMBEDDED)}, or the path of a Mitsuba XML file")
+        raise SceneError(f"unknown scene '{name}'; known: {', '.join(EMBEDDED)}, or the path of a Mitsuba XML file"
+                         + closest(name, EMBEDDED))
     return importlib.import_module(f"{__name__}.{name}")

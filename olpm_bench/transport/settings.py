@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, TypeVar
 
 from representations import wrong_type
+from representations.suggest import closest
 
 UNBOUNDED_DEPTH = 32                # where camera paths have no limit, particle paths end, and roulette ends camera paths
 MOST = 2 ** 31 - 1                  # of whole numbers, which become 32-bit ones
@@ -186,7 +187,7 @@ def preset_of(name: Any) -> dict[str, dict[str, Any]]:
         InputError: unknown preset.
     """
     if not isinstance(name, str) or name not in PRESETS:
-        raise InputError(f"unknown preset {name!r}; known: {', '.join(PRESETS)}")
+        raise InputError(f"unknown preset {name!r}; known: {', '.join(PRESETS)}{closest(str(name), PRESETS)}")
     return PRESETS[name]
 
 
@@ -196,8 +197,10 @@ def with_changes(settings: Settings, changes: dict[str, Any]) -> Settings:
     Raises:
         InputError: a key that is no field (the message lists them), or a value of a wrong type or out of its range.
     """
+    if not changes:
+        return settings
     known = [f.name for f in dataclasses.fields(settings)]  # type: ignore[arg-type]
     for key in changes:
         if key not in known:
-            raise InputError(f"unknown key '{key}'; known: {', '.join(known)}")
+            raise InputError(f"unknown key '{key}'; known: {', '.join(known)}{closest(key, known)}")
     return dataclasses.replace(settings, **changes)  # type: ignore[type-var]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_experiment import TOML
 
-from olpm_bench.bench import cell, config, experiment_file
+from olpm_bench.bench import cell, config, experiment_file, metrics
 from olpm_bench.bench.cell import CellFailedError, WarmUp
 from olpm_bench.bench.clock import Lap
 from olpm_bench.bench.config import Experiment
@@ -36,6 +36,9 @@ def test_a_cell_spends_its_samples_and_repeats_bit_for_bit(experiment):
     assert (first.image["count"] == 11).all() and np.isfinite(first.image["variance"]).all()
     assert first.info["records"] == 0 and first.info["train_seconds"] == 0 and first.info["passes"] == []
     assert first.info["training_ended"] is None
+    # Of walls in colours, as of the errors and in the page's viewer: all channels weigh the same.
+    assert first.info["mean"] == pytest.approx(first.image["mean"].mean(dtype=np.float64), rel=1e-6)
+    assert first.info["mean"] != pytest.approx(metrics.luminance(first.image["mean"]).mean(), rel=0.01)
     assert first.info["compiled_on_the_clock"] == 0
     assert 0 < first.info["charged_seconds"] <= first.info["wall_seconds"] + 1e-9
     other = cell.measure(experiment.cells()[2], scene, warm)         # another seed

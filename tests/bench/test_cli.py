@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import olpm_bench
 from olpm_bench import cli
 from olpm_bench.bench import config
 from olpm_bench.bench.exr import read_exr
@@ -97,8 +98,44 @@ def test_list_shows_scenes_representations_and_experiments(monkeypatch):
     monkeypatch.chdir(ROOT)
     result = call("list")
     assert result.exit_code == 0
-    for word in ("door_ajar", "gap = ", "gaussian_mixture", "experiments/quickstart.toml: Door ajar"):
+    for word in ("door_ajar", "gap = ", "gaussian_mixture", "    components: int = 8\n", "    first_fit: int | None = None\n",
+                 "    resolution: int = 16\n", "experiments/quickstart.toml: Door ajar"):
         assert word in result.output
+
+
+def test_list_shows_experiments_that_come_with_it_beside_ones_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("experiments").mkdir()
+    Path("experiments/smoke.toml").write_text('title = "My own"')
+    lines = call("list").output.splitlines()
+    assert "  quickstart: Door ajar by 20 cm, equal time" in lines and "  experiments/smoke.toml: My own" in lines
+    assert not any(line.startswith("  smoke:") for line in lines)
+
+
+def test_the_version():
+    result = call("--version")
+    assert result.exit_code == 0 and result.stdout == f"olpm-bench {olpm_bench.__version__}\n"
+
+
+@pytest.mark.parametrize("arguments, meant", [
+    (["rn"], "Did you mean 'run'?"),
+    (["run", "quikstart"], "; did you mean 'quickstart'?"),
+    (["run", "quickstart", "--only-scene", "door-ajr"], "; did you mean 'door_ajar'?"),
+    (["run", "quickstart", "--scene", "doorajar=x.xml"], "; did you mean 'door_ajar'?"),
+    (["run", "quickstart", "--scale", "smal"], "; did you mean 'small'?"),
+    (["inspect", "quickstart", "--pixel", "1,1", "--method", "Jansen"], "; did you mean 'Jensen'?"),
+    (["check", "Gaussian-Mixtures"], "; did you mean 'gaussian_mixture'?"),
+    (["check", "cosine", "--only", "densty"], "; did you mean 'density'?"),
+    (["check", "jensen", "--set", "representation.resolutoin=3"], "; did you mean 'resolution'?"),
+    (["fit", "--representation", "hay", "--samples", "a", "--heldout", "b"], "; did you mean 'hey'?"),
+    (["render", "dor_ajar", "--method", "hey", "--out", "a.exr", "--spp", "1"], "; did you mean 'door_ajar'?"),
+    (["render", "door_ajar", "--set", "scene.gpa=1", "--method", "hey", "--out", "a.exr", "--spp", "1"], "; did you mean 'gap'?"),
+    (["render", "door_ajar", "--set", "trainin.passes=1", "--method", "hey", "--out", "a.exr", "--spp", "1"],
+     "; did you mean 'training'?"),
+])
+def test_misspelt_names_are_mended(arguments, meant):
+    result = call(*arguments)
+    assert result.exit_code == 2 and meant in result.stderr and len(result.stderr) < 400
 
 
 def test_list_survives_what_lies_in_the_folder(tmp_path, monkeypatch):

@@ -135,12 +135,12 @@ def test_some_scenes_of_an_experiment(tmp_path):
 
 
 @pytest.mark.parametrize("old, new, words", [
-    ("seeds = 2", "sedes = 2", ["unknown key 'sedes' in test.toml", "known:", "seeds"]),
+    ("seeds = 2", "sedes = 2", ["unknown key 'sedes' in test.toml", "known:", "seeds", "; did you mean 'seeds'?"]),
     ("spp = 8", "spps = 8", ["unknown key 'spps' in test.toml [budget]", "seconds, spp, checkpoints"]),
     ("width = 16", "widht = 16", ["'widht' in test.toml [[scene]] 1", "width"]),
-    ("passes = 2", "pases = 2", ["unknown key 'pases' in test.toml [training]", "preset", "photons"]),
-    ("[training]", "[trainig]", ["unknown key 'trainig' in test.toml", "training"]),
-    ('roulette = "throughput"', 'roulete = "none"', ["'Cosine'", "unknown key 'roulete'", "roulette"]),
+    ("passes = 2", "pases = 2", ["unknown key 'pases' in test.toml [training]", "preset", "photons", "did you mean 'passes'?"]),
+    ("[training]", "[trainig]", ["unknown key 'trainig' in test.toml", "did you mean 'training'?"]),
+    ('roulette = "throughput"', 'roulete = "none"', ["'Cosine'", "unknown key 'roulete'", "did you mean 'roulette'?"]),
     ('roulette = "throughput"', 'roulette = "russian"', ["'Cosine'", "roulette", "'russian'", "'throughput'", "'none'"]),
     ('roulette = "throughput"', "max_depth = 5", ["max_depth", "[[scene]]"]),
     ("spp = 8", "spp = 8\nseconds = 3", ["[budget]", "give one of seconds and spp"]),

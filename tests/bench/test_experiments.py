@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from olpm_bench.bench import cell, config, experiment_file, reference_file, run
+from olpm_bench.bench import cell, config, experiment_file, plan, reference_file, run
 from olpm_bench.transport import settings
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments"
@@ -40,10 +40,10 @@ SCALES = [(name, scale) for name, table in FILES.items() for scale in (None, *ta
 def test_every_experiment_loads_at_every_scale(tmp_path, name, scale):
     """A dry run: nothing is loaded, compiled or rendered."""
     experiment = of_this_project(tmp_path, name, scale)
-    plan = run.plan(experiment, tmp_path)
-    assert plan["cells"] == plan["todo"] and 0 < plan["gigabytes"] < 24
-    if scale == "small" and plan["hours"] is not None:
-        assert plan["hours"] * 3600 <= SMALL_SECONDS
+    found = plan.plan(experiment, tmp_path)
+    assert found.cells == found.todo and 0 < found.gigabytes < 24
+    if scale == "small" and found.hours is not None:
+        assert found.hours * 3600 <= SMALL_SECONDS
     assert "small" in experiment.scale or scale
 
 

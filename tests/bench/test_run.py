@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from small_experiment import TOML, edit
 
-from olpm_bench.bench import experiment_file, finished, reference, run, summary
+from olpm_bench.bench import experiment_file, finished, plan, reference, run, summary
 from olpm_bench.bench.cell import CellFailedError
 from olpm_bench.bench.config import Experiment
 from olpm_bench.bench.files import ResultError, require_inside
@@ -222,12 +222,12 @@ def test_results_of_a_newer_version_are_left_alone(experiment, root):
 
 
 def test_a_plan_counts_what_is_left(experiment, root):
-    plan = run.plan(experiment, root)
-    assert len(plan["todo"]) == 4 and plan["hours"] is None and 0 < plan["gigabytes"] < 2
+    found = plan.plan(experiment, root)
+    assert len(found.todo) == 4 and found.hours is None and 0 < found.gigabytes < 2 and not found.refusals
     run.run(experiment, root)
-    assert run.plan(experiment, root)["todo"] == []
+    assert plan.plan(experiment, root).todo == []
     experiment.path.write_text(TOML.replace("spp = 11", "seconds = 900"))
-    assert run.plan(experiment_file.load(experiment.path), root)["hours"] == 1.0
+    assert plan.plan(experiment_file.load(experiment.path), root).hours == 1.0
 
 
 @pytest.mark.parametrize("preset, schedule", [("best", "interleaved"), ("paper2014", "single_batch")])

@@ -123,13 +123,32 @@ def test_the_commands_that_are_suggested_are_those_that_work(tmp_path, monkeypat
         words = shlex.split(command)
         assert words[0] == "olpm-bench" and words[1] in ("run", "reference")
         assert words[2:] == ["test.toml", "--scale", "small", "--results", "out", "--scene=room=my room.xml"]
-    result = CliRunner().invoke(app, [*words[1:], "--dry-run"])
+    result = CliRunner().invoke(app, [*words[1:], "--dry-run", "--with-reference"])
     assert words[1] == "run" and result.exit_code == 0, result.output
     results.write_text("experiment.toml", small.toml(results.folder))
     Path("experiments").mkdir()
     Path("test.toml").rename("experiments/test.toml")
     again = experiment_file.load(results.folder / "experiment.toml").of_results(results.folder.resolve())
     assert shlex.split(again.command("run", Path("out"))) == [*words[:2], "experiments/test.toml", *words[3:]]
+
+
+def test_methods_look_as_at_full_scale(tmp_path):
+    """The one that is left, a sweep with other values, and what is written into the results."""
+    swept = SMALL + ONE + """
+[[method]]
+name = "GMM"
+representation = { type = "gaussian_mixture" }
+sweep = { "training.passes" = [2, 4] }
+[scale.swept]
+method = [{ name = "GMM", sweep = { "training.passes" = [1, 4] } }]
+"""
+    full, small = load(tmp_path, None, TOML + swept), load(tmp_path, "swept", TOML + swept)
+    assert full.looks["GMM, passes 4"] == full.looks["GMM"] == len(full.method) - 1 and full.method[-1].look is None
+    assert small.looks == {"GMM, passes 1": 4, "GMM, passes 4": full.looks["GMM"], "GMM": full.looks["GMM"]}
+    (tmp_path / "resolved.toml").write_text(small.toml())
+    assert experiment_file.load(tmp_path / "resolved.toml").looks == small.looks
+    same = load(tmp_path, "small", TOML + swept)
+    assert same.looks == full.looks and all(method.look is None for method in same.method)
 
 
 @pytest.mark.parametrize("scale, text, words", [

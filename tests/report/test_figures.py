@@ -200,3 +200,10 @@ def test_scenes_without_reference_are_left_out(finished):
     assert drawn() == one
     finished.scenes.pop(0)
     assert figures.curves(finished) == sheet.sheet(finished, sheet.blocks(finished)) == []
+
+
+def test_no_two_looks_are_alike():
+    with figures.style():
+        looks = [figures._look(number) for number in range(3 * config.LOOKS)]
+    assert len({(look["color"], look["marker"]) for look in looks}) == len(looks)
+    assert len({look["color"] for look in looks[:config.LOOKS]}) == config.LOOKS

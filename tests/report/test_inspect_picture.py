@@ -7,6 +7,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from olpm_bench.bench.vertex import Density, Fit, Truth, Vertex, fit
 from olpm_bench.report import figures, inspect
@@ -22,13 +23,25 @@ def page() -> inspect.Page:
     vertex = Vertex(1, np.array([0, -3, 4.0]), d, np.zeros(3), np.eye(3), d * (1, 1, -1), True, "floor")
     even = np.full((4 * N, 4 * N), 1 / (2 * math.pi))
     columns = []
-    for name, density in (("Path tracing", Density(even)), ("Even", Density(even, even, 0.3, 7, 12345, 0.1)),
-                          ("Holes", Density(even, np.where(np.arange(4 * N) < 16, 0, 2 * even), 0.5, 7, 90, 0.1))):
+    densities = {"Path tracing": Density(even), "Even": Density(even, even, 0.3, 7, 12345, 0.1),
+                 "Holes": Density(even, np.where(np.arange(4 * N) < 16, 0, 2 * even), 0.5, 7, 90, 0.1)}
+    for look, (name, density) in enumerate(densities.items()):
         learnt = fit(truth.incident, density.guide) if density.guide is not None else None
         particles = {"photons": (np.array([[0, 0, 1], [0.6, 0, 0.8]]), np.array([1.5, 0.5]))} if learnt else {}
-        columns.append(inspect.Column(name, density, learnt, fit(truth.reflected, density.mixture), particles))
+        columns.append(inspect.Column(name, look, density, learnt, fit(truth.reflected, density.mixture), particles))
     image = rng.uniform(0, 1, (12, 16, 3))
     return inspect.Page("door", image, rng.integers(-1, 5, (12, 16)), (3, 4), vertex, truth, columns)
+
+
+def test_a_method_keeps_its_colour_where_others_are_left_out():
+    whole = page()
+    with figures.style():
+        for shown in (whole, dataclasses.replace(whole, columns=whole.columns[1:]),
+                      dataclasses.replace(whole, columns=whole.columns[:0:-1])):
+            colours = {text.get_text(): text.get_color() for text in inspect.draw(shown).findobj(Text)}
+            for column in shown.columns:
+                assert colours[column.name] == figures.colour(column.look)
+        assert len({figures.colour(column.look) for column in whole.columns}) == 3
 
 
 def test_the_disk_shows_each_direction_in_its_bin():
@@ -71,7 +84,7 @@ def test_a_picture_without_light_and_without_records_can_be_drawn(tmp_path):
     shown = page()
     dark = Truth(np.zeros((2, N * N)), np.zeros((2, N * N)), 128)
     nothing = Fit(math.nan, math.nan, math.nan)
-    columns = [inspect.Column("Path tracing", shown.columns[0].density, None, nothing, {})]
+    columns = [inspect.Column("Path tracing", 0, shown.columns[0].density, None, nothing, {})]
     dark_page = inspect.Page("dark", shown.image, None, (3, 4), shown.vertex, dark, columns)
     with figures.style():
         figures.save(inspect.draw(dark_page), tmp_path, "dark")

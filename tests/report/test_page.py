@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from olpm_bench.bench import config, run, summary
+from olpm_bench.bench import config, metrics, run, summary
 from olpm_bench.bench.finished import read
 from olpm_bench.report import figures, page, sheet
 
@@ -75,6 +75,19 @@ def test_the_page_holds_the_numbers_the_configuration_and_the_machine(finished):
                   "checkpoints = 5"):
         assert piece in text, piece
     assert "Quick & dirty" not in text.replace("\\u0026", "&amp;")
+
+
+def test_the_viewers_means_are_the_tables(finished):
+    """The viewer shows (r + g + b) / 3, mean over pixels, of the data that it is given."""
+    import simpleimageio
+
+    assert re.search(r"3==\w\?\(\w\+\w\+\w\)/3", simpleimageio.make_header())
+    book = page.viewers(finished, sheet.blocks(finished))[0]["data"]
+    cells = finished.scenes[0].cells["Path tracing"]
+    cell = cells[sheet.median_seed(finished.scenes[0].final["Path tracing"].errors["l1"])]
+    shown = decoded(book, book["names"].index("Path tracing"))
+    assert metrics.mean(shown) == pytest.approx(metrics.mean(cell.image()["mean"]), rel=1e-6)
+    assert metrics.mean(shown) == pytest.approx(np.mean(shown.astype(np.float64).sum(axis=-1) / 3), rel=1e-12)
 
 
 def test_warnings_of_training_stand_below_the_table(finished):
