@@ -151,32 +151,36 @@ class SceneFile:
     """An XML file as Mitsuba reads it.
 
     root: its root element; the attributes of all elements have values in place of `$name`.
-    folders: where Mitsuba looks for the files of its spectra, one after the other.
+    folders: where Mitsuba looks for files once it has read this one, one folder after the other.
+    spectra: the files that its elements name by the attribute `filename`, and where Mitsuba finds each.
     """
     root: ElementTree.Element
     folders: tuple[Path, ...]
+    spectra: tuple[tuple[str, Path | None], ...]
 
 
 def read(path: Path, overrides: dict[str, str]) -> tuple[dict[Path, SceneFile], list[str]]:
     """A scene file and all files that it includes, and the names of their parameters.
 
-    As Mitsuba 3.9.1: a ``<default>`` holds from there on, unless there is one already; an ``<include>`` is looked for beside
-    the file that it is in, then where that one was looked for, and last in the current folder.
+    As Mitsuba 3.9.1: a ``<default>`` holds from there on, unless there is one already.  An ``<include>`` is looked for beside
+    the file that it is in, then where that one was looked for, and last in the current folder.  A ``<path>`` is searched first
+    from there on, by its own file and those that this includes.
 
     Raises:
-        SceneError: one is missing or not XML, too many include each other, a parameter is too long, or there is a ``<path>``.
+        SceneError: one is missing or not XML, too many include each other, a parameter is too long, or a ``<path>`` is no folder.
     """
     found: dict[Path, SceneFile] = {}
     names: dict[str, None] = {}
     values = dict(overrides)
 
-    def add(file: Path, folders: tuple[Path, ...]) -> None:
+    def add(file: Path, folders: tuple[Path, ...], depth: int) -> None:
         if file in found:
             return
-        if len(folders) - 2 > MOST_INCLUDES:            # two are there from the beginning
+        if depth > MOST_INCLUDES:
             raise SceneError(f"scene file {path}: files include each other more than {MOST_INCLUDES} deep")
-        found[file] = SceneFile(read_xml(file), folders)
-        for element in found[file].root.iter():
+        root, spectra = read_xml(file), []
+        found[file] = SceneFile(root, folders, ())          # it may include itself
+        for element in root.iter():
             for key, text in element.items():
                 names.update(dict.fromkeys(re.findall(r"\$(\w+)", text)))
                 element.set(key, substitute(text, values))
@@ -187,14 +191,29 @@ def read(path: Path, overrides: dict[str, str]) -> tuple[dict[Path, SceneFile], 
                 names[name] = None
                 values.setdefault(name, value)
             elif element.tag == "path":
-                raise SceneError(f"scene file {file}: <path> is not supported, for Mitsuba would also look for plugins there, "
-                                 "whose code it runs; write the folder into the names of files")
+                folders = (_folder(file, element.get("value", ""), folders), *folders)
             elif element.tag == "include":
                 name, inner = element.get("filename", ""), (file.parent, *folders)
-                add(located(name, inner) or file.parent / name, inner)
+                add(located(name, inner) or file.parent / name, inner, depth + 1)
+            elif "filename" in element.attrib:
+                name = element.get("filename", "")
+                spectra.append((name, located(name, folders)))
+        found[file] = SceneFile(root, folders, tuple(spectra))
 
-    add(path, (path.parent, Path()))
+    add(path, (path.parent, Path()), 0)
     return found, list(names)
+
+
+def _folder(file: Path, name: str, folders: Sequence[Path]) -> Path:
+    """The folder that a ``<path>`` in a file names.
+
+    Raises:
+        SceneError: there is none.
+    """
+    folder = located(name, (file.parent, *folders))
+    if folder is None or not folder.is_dir():
+        raise SceneError(f"scene file {file}: <path>: there is no folder '{name}'")
+    return folder
 
 
 def substitute(text: str, values: dict[str, str]) -> str:
@@ -216,13 +235,11 @@ def named_files(path: Path, files: dict[Path, SceneFile]) -> Iterator[tuple[str,
     Any string may be a file's name.  Mitsuba looks for spectra when it reads the XML, for all else when that is done.
     """
     for file in files.values():
-        for element in file.root.iter():
-            if element.tag == "string":
-                name = element.get("value", "")
-                yield name, located(name, files[path].folders), element.get("name") == "filename"
-            elif element.tag != "include" and "filename" in element.attrib:
-                name = element.get("filename", "")
-                yield name, located(name, file.folders), True
+        for element in file.root.iter("string"):
+            name = element.get("value", "")
+            yield name, located(name, files[path].folders), element.get("name") == "filename"
+        for name, found in file.spectra:
+            yield name, found, True
 
 
 def _file_content(path: Path, overrides: dict[str, str]) -> list[list[Any]]:
