@@ -30,6 +30,8 @@ from olpm_bench.transport.settings import InputError
 
 LARGEST = 1e6           # parameter of an embedded scene
 MOST_INCLUDES = 14      # inside each other, as in Mitsuba
+# What a file says of its image beside its size and path depth, which older versions passed over.
+HONOURED = {"hide_emitters", "hideEmitters", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y"}
 LONGEST = 4096          # characters of a scene file's parameter, which can be made of others that are made of others
 EMBEDDED = ("door_ajar", "living_room", "classroom", "cornell_box")
 
@@ -114,7 +116,10 @@ def digest(name_or_path: str | Path, changes: dict[str, Any] | None = None) -> s
     if is_file(name_or_path):
         path = Path(name_or_path)
         overrides = {key: str(value) for key, value in (changes or {}).items()}
-        content = {"overrides": overrides, "files": _file_content(path, overrides)}
+        files, _ = read(path, overrides)
+        content: dict[str, Any] = {"overrides": overrides, "files": _file_content(path, files)}
+        if any(element.get("name") in HONOURED for file in files.values() for element in file.root.iter()):
+            content["honoured"] = 1         # references and cells of versions that passed over it do not count
     else:
         name = str(name_or_path)
         content = {"scene": name, "version": _module(name).VERSION, "parameters": resolve(name, changes)}
@@ -182,8 +187,9 @@ def read(path: Path, overrides: dict[str, str]) -> tuple[dict[Path, SceneFile], 
         found[file] = SceneFile(root, folders, ())          # it may include itself
         for element in root.iter():
             for key, text in element.items():
-                names.update(dict.fromkeys(re.findall(r"\$(\w+)", text)))
-                element.set(key, substitute(text, values))
+                if "$" in text:
+                    names.update(dict.fromkeys(re.findall(r"\$(\w+)", text)))
+                    element.set(key, substitute(text, values))
             if element.tag == "default":
                 name, value = element.get("name", ""), element.get("value", "")
                 if len(value) > LONGEST:
@@ -242,9 +248,8 @@ def named_files(path: Path, files: dict[Path, SceneFile]) -> Iterator[tuple[str,
             yield name, found, True
 
 
-def _file_content(path: Path, overrides: dict[str, str]) -> list[list[Any]]:
-    """[name, SHA-256 of the contents (None: missing)] of a scene file and of all files it refers to."""
-    files, _ = read(path, overrides)
+def _file_content(path: Path, files: dict[Path, SceneFile]) -> list[list[Any]]:
+    """[name, SHA-256 of the contents (None: missing)] of a scene file, as it was read, and of all files it refers to."""
     content: list[list[Any]] = [[f.name, _sha256(f)] for f in files]
     for name, file, must_be in named_files(path, files):
         sha256 = _sha256(file) if file is not None and file.is_file() else None

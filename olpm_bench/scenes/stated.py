@@ -27,6 +27,7 @@ class Stated:
     hide_emitters: emitters that the camera sees directly are black.
     spp: samples a pixel; None: not said.
     sensor: its type.
+    shapes: how many there are.
     replaced: (what the harness has, what the file says) of all that it replaces.
     """
     width: int
@@ -37,6 +38,7 @@ class Stated:
     hide_emitters: bool
     spp: int | None
     sensor: str
+    shapes: int
     replaced: list[tuple[str, str]] = field(default_factory=list)
 
     def window(self, width: int, height: int) -> dict[str, int]:
@@ -117,7 +119,8 @@ def stated(state: Any) -> Stated:
     depth = MAX_DEPTH.get(tracers[-1].plugin_name(), -1) if tracers else -1
     spp = _whole(samplers[0][1].props, "sample_count", 0) if samplers else 0
     return Stated(width, height, size, (x, y), _first(tracers, "max_depth", depth), _first(tracers, "hide_emitters", False),
-                  spp if spp > 0 else None, plugin, _replaced(state, film, samplers, tracers, len(found)))
+                  spp if spp > 0 else None, plugin, sum(node.type == kind.Shape for node in state.nodes),
+                  _replaced(state, film, samplers, tracers, len(found)))
 
 
 def _replaced(state: Any, film: Any, samplers: list[tuple[str, Any]], tracers: list[Any], n_sensors: int,

@@ -35,6 +35,8 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
     Args:
         settings: depth, roulette and BSDF fraction.
         guide: from `olpm_bench.train` or `Guide.load`; None traces unguided.
+
+    Emitters that the camera sees directly are black where the scene's own integrator says so, too, by `hide_emitters`.
     """
 
     def __init__(self, settings: IntegratorSettings | None = None, guide: Guide | None = None,
@@ -80,7 +82,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
 
     def paths_a_lane(self, sensor: mi.Sensor, spp: int) -> int:
         """How many samples of its pixel a lane takes: one without a guide, where more save nothing."""
-        return 1 if self.guide is None or self.hide_emitters else paths_a_lane(sensor, spp)
+        return 1 if self.guide is None else paths_a_lane(sensor, spp)
 
     @staticmethod
     def _splat(block, film, position, value, weight, alpha, ray):
@@ -109,6 +111,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         end_paths, know_worth = self.settings.roulette != "none", pixel is not None
         worth = window * pixel if pixel is not None else mi.Float(0)        # what a path is worth to its pixel
         ctx = mi.BSDFContext()
+        hide_emitters = self.hide_emitters or getattr(scene.integrator(), "hide_emitters", False)
 
         ray = mi.Ray3f(ray)
         L = mi.Spectrum(0)                              # radiance carried to the camera
@@ -120,7 +123,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         si_prev = dr.zeros(mi.Interaction3f)            # the vertex the ray leaves, ...
         pdf_prev = mi.Float(1)                          # ... the density it was continued with,
         delta_prev = mi.Bool(True)                      # ... and whether that was a specular direction
-        valid_ray = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+        valid_ray = mi.Bool(not hide_emitters and scene.environment() is not None)
 
         while active:
             si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=(depth == 0), active=active)
@@ -128,7 +131,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             # ---------------------- Direct emission ----------------------
             ds = mi.DirectionSample3f(scene, si, si_prev)
             emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, active & ~delta_prev)
-            visible = active & ~((depth == 0) & self.hide_emitters)
+            visible = active & ~((depth == 0) & hide_emitters)
             emitted = ds.emitter.eval(si, visible) & visible
             L += beta * mis_weight(pdf_prev, emitter_pdf) * emitted
             if dr.hint(log is not None, mode="scalar"):
