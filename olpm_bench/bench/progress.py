@@ -15,7 +15,6 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from olpm_bench.bench.terminal import plain_console
 
 QUIET_SECONDS = 30.0        # between lines where there is no terminal
-SOON = 3.0                  # [s] after which a step is named there that has not ended yet
 
 
 def is_interrupt(error: BaseException | None) -> bool:
@@ -85,7 +84,7 @@ def activity(label: str) -> Iterator[None]:
     """
     console = plain_console(stderr=True)
     if not sys.stderr.isatty():
-        timer = threading.Timer(SOON, lambda: console.print(f"olpm-bench: {label}", soft_wrap=True))
+        timer = threading.Timer(QUIET_SECONDS, lambda: console.print(f"olpm-bench: {label}", soft_wrap=True))
         timer.daemon = True
         timer.start()
         try:

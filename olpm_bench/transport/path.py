@@ -6,6 +6,7 @@ A unidirectional path tracer with next-event estimation, as Mitsuba's `path`.  T
 """
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -15,6 +16,7 @@ from olpm_bench.transport import roulette
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.camera_rays import CameraRays, paths_a_lane, sums_samples
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.scene_checks import Fingerprint, require_valid_box
 from olpm_bench.transport.settings import IntegratorSettings
 
 if TYPE_CHECKING:
@@ -44,6 +46,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         super().__init__(props or mi.Properties("guided_path"))
         self.settings = settings or IntegratorSettings()
         self.guide = guide
+        self.checked: tuple[mi.Scene, Guide | None] | None = None
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """An image, as `mi.render` asks for it."""
@@ -60,6 +63,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             spp: samples a pixel; 0: as many as the scene asks for.
             log: keeps the vertices; of as many paths as the image has samples.
         """
+        self._check(scene)
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
         with dr.suspend_grad():
             camera = CameraRays(sensor, spp, self.paths_a_lane(sensor, spp))
@@ -79,6 +83,22 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             self._splat(block, film, position, L, weight, alpha, ray)
             film.put_block(block)
             return film.develop()
+
+    def _check(self, scene: mi.Scene) -> None:
+        """Once for each scene and guide: refuse what can only give wrong images, and warn of a guide that is of no use.
+
+        Raises:
+            InputError: the scene has lights at infinity and shapes without a valid box.
+        """
+        if self.checked is not None and self.checked[0] is scene and self.checked[1] is self.guide:
+            return
+        require_valid_box(scene)
+        if self.guide is not None and self.guide.scene is not None:
+            difference = Fingerprint.of(scene).difference(self.guide.scene)
+            if difference is not None:
+                warnings.warn(f"the guide was trained in another scene: this one has {difference}; the image is right, but "
+                              "guided by what was learnt elsewhere", stacklevel=3)
+        self.checked = scene, self.guide
 
     def paths_a_lane(self, sensor: mi.Sensor, spp: int) -> int:
         """How many samples of its pixel a lane takes: one without a guide, where more save nothing."""
