@@ -2,7 +2,8 @@
 
 As a library, imported before `mitsuba` and `drjit` so that these find a libLLVM that works, and after `mi.set_variant`:
 
-    guide = olpm_bench.train(scene, "gaussian_mixture", camera_passes=24)
+    scene = olpm_bench.load_scene("scene.xml")
+    guide = olpm_bench.train(scene, "gaussian_mixture", components=8, camera_passes=24)
     image = mi.render(scene, integrator=olpm_bench.integrator(guide, max_depth=13), spp=64)
 
 or `olpm_bench.register()`, and then the Mitsuba plugin `guided_path`.
@@ -29,6 +30,7 @@ except ImportError as error:
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from olpm_bench.training_progress import OnPass
     from olpm_bench.transport.guide import Guide
     from olpm_bench.transport.path import GuidedPathIntegrator
 
@@ -54,38 +56,107 @@ def register() -> None:
     _registered = variant
 
 
+def load_scene(path: str | Path, parameters: dict[str, Any] | None = None, *, width: int | None = None,
+               height: int | None = None, max_depth: int | None = None) -> mi.Scene:
+    """An embedded scene, or a Mitsuba XML file with a box filter and without merged meshes, in which guides can be trained.
+
+    Args:
+        path: of the file, or the name of an embedded scene.
+        parameters: values for the file's ``<default>`` parameters, or the embedded scene's parameters.
+        width, height, max_depth: of the image [pixels], and of ``scene.integrator()``; what the scene says by default.
+
+    Raises:
+        SceneError: it cannot be used; the message says why.
+    """
+    register()
+    from olpm_bench.scenes import load
+    from olpm_bench.transport.arguments import require_type
+    require_type("path", path, (str, Path), "the path of a file, or a name")
+    return load.load(path, parameters, width, height, max_depth)
+
+
+def load_guide(path: str | Path, representation: str | None = None) -> Guide:
+    """A guide that ``guide.save(path)`` has written.
+
+    Args:
+        representation: the type that it must be of.  FILE.py:Class, whose code is then run, must be given.
+
+    Raises:
+        InputError: it is no whole guide file, or of another version or type.
+        OSError: it can't be read.
+    """
+    register()
+    from olpm_bench.transport.arguments import require_type
+    from olpm_bench.transport.guide import Guide
+    require_type("path", path, (str, Path), "the path of a file")
+    return Guide.load(path, representation)
+
+
 def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixture", *, max_depth: int = 13, seed: int = 0,
           preset: str = "best", integrator: dict[str, Any] | None = None, sensor: mi.Sensor | None = None,
-          **settings: Any) -> Guide:
+          progress: bool | OnPass = True, **settings: Any) -> Guide:
     """Train a guide on a scene.
 
     Args:
         representation: a registered name, or ``{"type": name, ...hyper-parameters}``.
         max_depth: of the camera paths to be guided [segments].
-        preset, settings: of `olpm_bench.transport.settings.TrainingSettings`: passes, photons, importons, gather, ...  All passes
-            are done: `share`, `blend` and `while_rendering` concern the budgets of `olpm-bench run` only.
+        preset, settings: of `olpm_bench.transport.settings.TrainingSettings`: passes, photons, importons, gather, ..., and the
+            hyper-parameters of the representation: components, ...  All passes are done: `share`, `blend` and
+            `while_rendering` concern the budgets of `olpm-bench run` only.
         integrator: of `IntegratorSettings`, for the passes of camera paths: roulette, fraction, ...
         sensor: the camera from which importons and camera paths start, and whose pixels the roulette weighs paths for; the
             scene's first by default.  The guide is right for others, too, but not made for them.
+        progress: True draws a bar where standard error is a terminal, False none; or a function that is called with the
+            `PassStatistics` of each pass.
 
     Returns:
-        A guide, which can be saved, loaded (`olpm_bench.transport.guide.Guide.load`) and handed to :func:`integrator`.
+        A guide, which can be saved, loaded by :func:`load_guide` and handed to :func:`integrator`.
+
+    Raises:
+        InputError: a setting that is not known or out of its range, or a scene that can't be guided in.
+        RepresentationError: there is no such representation, or a hyper-parameter has a wrong value.
     """
     register()
+    import mitsuba as mi
+
+    from olpm_bench.training_progress import training_progress
     from olpm_bench.transport import settings as options
     from olpm_bench.transport import training
-    return training.train(scene, representation, options.training(preset, **settings),
-                          options.integrator(preset, max_depth=max_depth, **integrator or {}), seed=seed, sensor=sensor)
+    from olpm_bench.transport.arguments import distributed, require_type
+    require_type("scene", scene, mi.Scene, "a Mitsuba scene, as of olpm_bench.load_scene(path)")
+    require_type("representation", representation, (str, dict), "a name, or {'type': name, ...}")
+    require_type("sensor", sensor, (mi.Sensor, type(None)), "one of the scene's sensors")
+    specification = {"type": representation} if isinstance(representation, str) else dict(representation)
+    require_type("representation's type", specification.get("type"), str, "a name")
+    require_type("preset", preset, str, "a name")
+    require_type("seed", seed, int, "a whole number")
+    own, hyper_parameters = distributed(settings, options.TrainingSettings, representation=specification["type"])
+    of_paths, = distributed({"max_depth": max_depth} | (integrator or {}), options.IntegratorSettings)
+    with training_progress(progress) as on_pass:
+        return training.train(scene, specification | hyper_parameters, options.training(preset, **own),
+                              options.integrator(preset, **of_paths), seed=seed, sensor=sensor, on_pass=on_pass)
 
 
-def integrator(guide: Guide | None = None, preset: str = "best", **settings: Any) -> GuidedPathIntegrator:
+def integrator(guide: Guide | str | Path | None = None, preset: str = "best", **settings: Any) -> GuidedPathIntegrator:
     """A path tracer with a guide, or an unguided one.
 
     Args:
+        guide: as :func:`train` returns it, or the file of one.
         preset: the one that the guide was trained with brings its roulette.
         settings: of `olpm_bench.transport.settings.IntegratorSettings`: max_depth, roulette, rr_depth, window, fraction.
+
+    Raises:
+        InputError: a setting that is not known or out of its range, or a file that holds no guide.
+        OSError: the file can't be read.
     """
     register()
+    from olpm_bench.transport.arguments import distributed, require_type
+    from olpm_bench.transport.guide import Guide
     from olpm_bench.transport.path import GuidedPathIntegrator
+    from olpm_bench.transport.settings import IntegratorSettings
     from olpm_bench.transport.settings import integrator as of_preset
-    return GuidedPathIntegrator(of_preset(preset, **settings), guide)
+    require_type("guide", guide, (Guide, str, Path, type(None)), "a guide, the file of one, or None")
+    require_type("preset", preset, str, "a name")
+    own, = distributed(settings, IntegratorSettings)
+    loaded = load_guide(guide) if isinstance(guide, str | Path) else guide
+    return GuidedPathIntegrator(of_preset(preset, **own), loaded)

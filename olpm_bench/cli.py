@@ -9,6 +9,7 @@ import functools
 import json
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -69,6 +70,7 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
     def run(*args: Any, **kwargs: Any) -> None:
         previous = {number: signal.signal(number, _interrupt) for number in ENDING
                     if signal.getsignal(number) is signal.SIG_DFL}      # nohup ignores one
+        shown, warnings.showwarning = warnings.showwarning, _warn
         try:
             body(*args, **kwargs)
         except (typer.Exit, typer.Abort):
@@ -96,10 +98,16 @@ def command(body: Callable[..., None]) -> Callable[..., None]:
             complain(str(error))
             raise typer.Exit(BAD_INPUT) from None
         finally:
+            warnings.showwarning = shown
             for number, handler in previous.items():
                 signal.signal(number, handler)
     name = body.__name__.strip("_")
     return app.command(name, epilog=epilog(name))(run)
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """A Python warning as one line."""
+    complain(str(message))
 
 
 def _interrupt(signum: int, frame: object) -> None:
@@ -332,16 +340,23 @@ def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedd
            out: Annotated[Path, typer.Option(metavar="FILE.exr", show_default=False)],
            set_: Assignments = [],  # noqa: B006
            seconds: Annotated[float | None, typer.Option(help="Charged seconds, training included.")] = None,
-           spp: Annotated[int | None, typer.Option(help="Samples per pixel; repeats bit for bit.")] = None,
-           width: int = 320, height: int = 180, max_depth: int | None = None, seed: int = 0,
+           spp: Annotated[int | None, typer.Option(help="Samples per pixel; repeats bit for bit.  That of the file by "
+                                                   "default.")] = None,
+           width: Annotated[int | None, typer.Option(help="Of the image [pixels]; that of the file by default, 320 of an "
+                                                     "embedded scene.", show_default=False)] = None,
+           height: Annotated[int | None, typer.Option(help="By default as the width and the scene's aspect say.",
+                                                      show_default=False)] = None,
+           max_depth: Annotated[int | None, typer.Option(help="Longest path in segments, -1 for no limit; that of the file by "
+                                                         "default, 13 of an embedded scene.", show_default=False)] = None,
+           seed: int = 0,
            threads: Annotated[int | None, typer.Option(help="Threads; all cores by default.")] = None,
            save_guide: Annotated[Path | None, typer.Option(metavar="FILE.npz", show_default=False)] = None,
            load_guide: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="Use this guide; train none.",
                                                            show_default=False)] = None,
            records_map: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the guide's records over the image.",
                                                             show_default=False)] = None,
-           ) -> None:
-    """Render one image; the last line printed is one JSON object."""
+           json_: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False) -> None:
+    """Render one image, and say in three lines what it is, where it is, and how long it took."""
     from olpm_bench.bench import environment
 
     if save_guide is not None and load_guide is not None:
@@ -349,14 +364,18 @@ def render(scene: Annotated[str, typer.Argument(metavar="SCENE", help="An embedd
     environment.select_variant(threads)
     from olpm_bench.bench import render_one
     from olpm_bench.bench.files import plain
-    from olpm_bench.bench.results import warnings
+    from olpm_bench.bench.results import warnings as warnings_of
 
     spec = render_one.cell(scene, method, set_, seconds=seconds, spp=spp, width=width, height=height,
                            max_depth=max_depth, seed=seed, load_guide=load_guide)
     done = render_one.render(spec, out, save_guide=save_guide, load_guide=load_guide, records_map=records_map)
-    for warning in warnings([done]):
+    for warning in warnings_of([done]):
         print(f"olpm-bench: {warning}", file=sys.stderr)
-    print(json.dumps(plain(done), allow_nan=False))
+    if json_:
+        print(json.dumps(plain(done), allow_nan=False))
+    else:
+        for line in render_one.summary(done):
+            print(one_line(line))
 
 
 @command

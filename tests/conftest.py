@@ -1,6 +1,8 @@
 """Shared by all tests: a libLLVM that works, the variant, and a clean Dr.Jit between modules."""
 from __future__ import annotations
 
+import os
+
 import representations  # noqa: F401  (selects libLLVM before drjit is imported)
 
 # isort: split
@@ -19,6 +21,12 @@ def variant() -> str:
     """Every test runs in the variant that needs no GPU."""
     mi.set_variant("llvm_ad_rgb")
     return mi.variant()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def cache_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """No test knows which scene files others, or the user, have loaded."""
+    os.environ["OLPM_BENCH_CACHE"] = str(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture(autouse=True, scope="module")

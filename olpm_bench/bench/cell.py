@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from olpm_bench.bench import environment, metrics, probe
 from olpm_bench.bench.accumulator import Accumulator
 from olpm_bench.bench.clock import Clock
 from olpm_bench.bench.config import CellSpec
+from olpm_bench.bench.progress import activity
 from olpm_bench.scenes import load as scene_load
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.settings import TrainingSettings
@@ -54,13 +56,19 @@ def pass_seed(seed: int, index: int) -> int:
 def load_scene(spec: CellSpec) -> mi.Scene:
     """The scene of a cell.
 
+    A Python warning says in one line what is not as a scene file says.
+
     Raises:
         SceneError: it cannot be used.
     """
-    s = spec.scene
-    if s.file is not None:
-        probe.check(s.file, s.arguments)
-    return scene_load.load(s.file or s.name, s.arguments, s.width, s.height, spec.integrator.max_depth)
+    s, max_depth = spec.scene, spec.integrator.max_depth
+    if s.file is None:
+        return scene_load.load(s.name, s.arguments, s.width, s.height, max_depth)
+    stated = probe.check(s.file, s.arguments)
+    if (differences := stated.differences(s.width, s.height, max_depth)) is not None:
+        warnings.warn(f"scene file {s.file}: {differences}", stacklevel=2)
+    with activity(f"loading {s.file.name}: {stated.shapes:,} shapes"):
+        return scene_load.load(s.file, s.arguments, s.width, s.height, max_depth)
 
 
 # ---------------------------------------------------------------- kernels

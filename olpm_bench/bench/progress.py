@@ -5,9 +5,12 @@ Drawn only when told to, between timed passes: a bar that redraws itself would r
 from __future__ import annotations
 
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from olpm_bench.bench.terminal import plain_console
 
@@ -70,3 +73,26 @@ class Bar:
     def say(self, line: str) -> None:
         """A line that stays."""
         self.console.print(line, soft_wrap=True)
+
+
+@contextmanager
+def activity(label: str) -> Iterator[None]:
+    """Say what is going on in the body, of which nobody knows how far it is.
+
+    On a terminal there is the time that it has taken so far, elsewhere a line if it takes long.  Not for what is on the clock:
+    it redraws itself, though seldom.
+    """
+    console = plain_console(stderr=True)
+    if not sys.stderr.isatty():
+        timer = threading.Timer(QUIET_SECONDS, lambda: console.print(f"olpm-bench: {label}", soft_wrap=True))
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+        return
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, refresh_per_second=2) as progress:
+        progress.add_task(label, total=None)
+        yield

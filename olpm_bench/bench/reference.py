@@ -143,7 +143,8 @@ def _improve(spec: CellSpec, experiment: Experiment, root: Path, seconds: float,
         pixels = spec.scene.width * spec.scene.height
         headroom.require(pixels * 3 * 8 * 8, f"the halves of a reference of {pixels} pixels", "a smaller image")
         scene = cell.load_scene(spec)
-        integrator = mi.load_dict({"type": "path", "max_depth": experiment.max_depth(spec.scene), "rr_depth": 5})
+        integrator = mi.load_dict({"type": "path", "max_depth": experiment.max_depth(spec.scene), "rr_depth": 5,
+                                   "hide_emitters": scene.integrator().hide_emitters})
         meta = {"key": key, "scene": spec.scene.name, "width": spec.scene.width, "height": spec.scene.height,
                 "max_depth": experiment.max_depth(spec.scene), "parameters": spec.scene.resolved_arguments(),
                 "wanted_seconds": halves.seconds + seconds,         # more than "seconds" if this is interrupted

@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from olpm_bench.transport.camera_paths import wanted
+from olpm_bench.transport.camera_rays import sample_ray
 from olpm_bench.transport.gather import Gathered
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
@@ -90,7 +91,7 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, pixel: tuple[int, int], max_depth:
         raise InputError(f"pixel {pixel[0]},{pixel[1]} is outside the image, {width}x{height}: x from 0 to {width - 1}, "
                          f"y from 0 to {height - 1}")
     film = mi.Point2f(dr.opaque(mi.Float, (pixel[0] + 0.5) / width), dr.opaque(mi.Float, (pixel[1] + 0.5) / height))
-    ray, _ = sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
+    ray, _ = sample_ray(sensor, 0.0, 0.5, film, mi.Point2f(0.5))
     up = np.array(sensor.world_transform() @ mi.Vector3f(0, 1, 0)).ravel()
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, 1)

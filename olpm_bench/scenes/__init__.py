@@ -31,6 +31,8 @@ from olpm_bench.transport.settings import InputError
 
 LARGEST = 1e6           # parameter of an embedded scene
 MOST_INCLUDES = 14      # inside each other, as in Mitsuba
+# What a file says of its image beside its size and path depth, which older versions passed over.
+HONOURED = {"hide_emitters", "hideEmitters", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y"}
 LONGEST = 4096          # characters of a scene file's parameter, which can be made of others that are made of others
 EMBEDDED = ("door_ajar", "living_room", "classroom", "cornell_box")
 
@@ -116,7 +118,10 @@ def digest(name_or_path: str | Path, changes: dict[str, Any] | None = None) -> s
     if is_file(name_or_path):
         path = Path(name_or_path)
         overrides = {key: str(value) for key, value in (changes or {}).items()}
-        content = {"overrides": overrides, "files": _file_content(path, overrides)}
+        files, _ = read(path, overrides)
+        content: dict[str, Any] = {"overrides": overrides, "files": _file_content(path, files)}
+        if any(element.get("name") in HONOURED for file in files.values() for element in file.root.iter()):
+            content["honoured"] = 1         # references and cells of versions that passed over it do not count
     else:
         name = str(name_or_path)
         content = {"scene": name, "version": _module(name).VERSION, "parameters": resolve(name, changes)}
@@ -153,35 +158,40 @@ class SceneFile:
     """An XML file as Mitsuba reads it.
 
     root: its root element; the attributes of all elements have values in place of `$name`.
-    folders: where Mitsuba looks for the files of its spectra, one after the other.
+    folders: where Mitsuba looks for files once it has read this one, one folder after the other.
+    spectra: the files that its elements name by the attribute `filename`, and where Mitsuba finds each.
     """
     root: ElementTree.Element
     folders: tuple[Path, ...]
+    spectra: tuple[tuple[str, Path | None], ...]
 
 
 def read(path: Path, overrides: dict[str, str]) -> tuple[dict[Path, SceneFile], list[str]]:
     """A scene file and all files that it includes, and the names of their parameters.
 
-    As Mitsuba 3.9.1: a ``<default>`` holds from there on, unless there is one already; an ``<include>`` is looked for beside
-    the file that it is in, then where that one was looked for, and last in the current folder.
+    As Mitsuba 3.9.1: a ``<default>`` holds from there on, unless there is one already.  An ``<include>`` is looked for beside
+    the file that it is in, then where that one was looked for, and last in the current folder.  A ``<path>`` is searched first
+    from there on, by its own file and those that this includes.
 
     Raises:
-        SceneError: one is missing or not XML, too many include each other, a parameter is too long, or there is a ``<path>``.
+        SceneError: one is missing or not XML, too many include each other, a parameter is too long, or a ``<path>`` is no folder.
     """
     found: dict[Path, SceneFile] = {}
     names: dict[str, None] = {}
     values = dict(overrides)
 
-    def add(file: Path, folders: tuple[Path, ...]) -> None:
+    def add(file: Path, folders: tuple[Path, ...], depth: int) -> None:
         if file in found:
             return
-        if len(folders) - 2 > MOST_INCLUDES:            # two are there from the beginning
+        if depth > MOST_INCLUDES:
             raise SceneError(f"scene file {path}: files include each other more than {MOST_INCLUDES} deep")
-        found[file] = SceneFile(read_xml(file), folders)
-        for element in found[file].root.iter():
+        root, spectra = read_xml(file), []
+        found[file] = SceneFile(root, folders, ())          # it may include itself
+        for element in root.iter():
             for key, text in element.items():
-                names.update(dict.fromkeys(re.findall(r"\$(\w+)", text)))
-                element.set(key, substitute(text, values))
+                if "$" in text:
+                    names.update(dict.fromkeys(re.findall(r"\$(\w+)", text)))
+                    element.set(key, substitute(text, values))
             if element.tag == "default":
                 name, value = element.get("name", ""), element.get("value", "")
                 if len(value) > LONGEST:
@@ -189,14 +199,29 @@ def read(path: Path, overrides: dict[str, str]) -> tuple[dict[Path, SceneFile], 
                 names[name] = None
                 values.setdefault(name, value)
             elif element.tag == "path":
-                raise SceneError(f"scene file {file}: <path> is not supported, for Mitsuba would also look for plugins there, "
-                                 "whose code it runs; write the folder into the names of files")
+                folders = (_folder(file, element.get("value", ""), folders), *folders)
             elif element.tag == "include":
                 name, inner = element.get("filename", ""), (file.parent, *folders)
-                add(located(name, inner) or file.parent / name, inner)
+                add(located(name, inner) or file.parent / name, inner, depth + 1)
+            elif "filename" in element.attrib:
+                name = element.get("filename", "")
+                spectra.append((name, located(name, folders)))
+        found[file] = SceneFile(root, folders, tuple(spectra))
 
-    add(path, (path.parent, Path()))
+    add(path, (path.parent, Path()), 0)
     return found, list(names)
+
+
+def _folder(file: Path, name: str, folders: Sequence[Path]) -> Path:
+    """The folder that a ``<path>`` in a file names.
+
+    Raises:
+        SceneError: there is none.
+    """
+    folder = located(name, (file.parent, *folders))
+    if folder is None or not folder.is_dir():
+        raise SceneError(f"scene file {file}: <path>: there is no folder '{name}'")
+    return folder
 
 
 def substitute(text: str, values: dict[str, str]) -> str:
@@ -218,18 +243,15 @@ def named_files(path: Path, files: dict[Path, SceneFile]) -> Iterator[tuple[str,
     Any string may be a file's name.  Mitsuba looks for spectra when it reads the XML, for all else when that is done.
     """
     for file in files.values():
-        for element in file.root.iter():
-            if element.tag == "string":
-                name = element.get("value", "")
-                yield name, located(name, files[path].folders), element.get("name") == "filename"
-            elif element.tag != "include" and "filename" in element.attrib:
-                name = element.get("filename", "")
-                yield name, located(name, file.folders), True
+        for element in file.root.iter("string"):
+            name = element.get("value", "")
+            yield name, located(name, files[path].folders), element.get("name") == "filename"
+        for name, found in file.spectra:
+            yield name, found, True
 
 
-def _file_content(path: Path, overrides: dict[str, str]) -> list[list[Any]]:
-    """[name, SHA-256 of the contents (None: missing)] of a scene file and of all files it refers to."""
-    files, _ = read(path, overrides)
+def _file_content(path: Path, files: dict[Path, SceneFile]) -> list[list[Any]]:
+    """[name, SHA-256 of the contents (None: missing)] of a scene file, as it was read, and of all files it refers to."""
     content: list[list[Any]] = [[f.name, _sha256(f)] for f in files]
     for name, file, must_be in named_files(path, files):
         sha256 = _sha256(file) if file is not None and file.is_file() else None

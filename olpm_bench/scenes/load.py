@@ -1,13 +1,15 @@
 """Any scene as a ``mi.Scene`` that the harness can measure: embedded ones, and Mitsuba 3 XML files.
 
 Whatever the scene says, its film is an RGB float32 `hdrfilm` with the box filter (with it images do not depend on
-the number of threads), its sampler is `independent`, its integrator is `path`, and it has one sensor, the first.
+the number of threads), its sampler is `independent`, its integrator is `path`, and it has one sensor, the first.  The size of
+the image, its crop window, `max_depth` and `hide_emitters` are those of the file; `Parsed.stated` tells what is not.
 """
 from __future__ import annotations
 
 import re
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ import mitsuba as mi
 
 from olpm_bench import scenes
 from olpm_bench.scenes import SceneError, SceneFile
+from olpm_bench.scenes.stated import children, sensors, stated
+from olpm_bench.suggest import closest
 
 VARIANTS = r"(llvm|cuda)_(ad_)?rgb"
 LARGEST = 1 << 15               # pixels along a side
@@ -45,7 +49,7 @@ def load(name_or_path: str | Path, parameters: dict[str, Any] | None = None, wid
     if max_depth is not None and not (_is_integer(max_depth) and (max_depth >= 1 or max_depth == -1)):
         raise SceneError(f"max_depth = {max_depth!r}: must be an integer >= 1, or -1 for no limit")
     if scenes.is_file(name_or_path):
-        return _from_file(Path(name_or_path), parameters or {}, width, height, max_depth)
+        return Parsed(Path(name_or_path), parameters).build(width, height, max_depth)
     return _embedded(str(name_or_path), parameters, width, height, max_depth)
 
 
@@ -89,47 +93,94 @@ def _embedded(name: str, parameters: dict[str, Any] | None, width: int | None, h
     sensor["film"] = {"type": "hdrfilm", **FILM, **size, "rfilter": {"type": "box"}}
     sensor["sampler"] = {"type": "independent"}
     scene["integrator"] = {"type": "path", "max_depth": -1 if max_depth is None else max_depth}
-    return mi.load_dict(scene, optimize=False)          # merges no meshes: see _from_file
+    return mi.load_dict(scene, optimize=False)          # merges no meshes: see Parsed.build
 
 
-def _from_file(path: Path, parameters: dict[str, Any], width: int | None, height: int | None,
-               max_depth: int | None) -> mi.Scene:
-    values = {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in parameters.items()}
-    files, known = scenes.read(path, values)
-    if (tag := files[path].root.tag) != "scene":
-        raise SceneError(f"scene file {path}: its root element is <{tag}>, must be Mitsuba 3's <scene>")
-    _check_text(path, files)
-    for key in parameters:
-        if key not in known:
-            raise SceneError(f"scene file {path} has no parameter '{key}'; "
-                             f"its <default> parameters: {', '.join(known) or 'none'}")
-    config = mi.parser.ParserConfig(str(mi.variant()))
-    config.unused_parameters = mi.LogLevel.Debug            # a <default> that nothing uses is no error
-    parser: Any = mi.parser
-    resolver = mi.file_resolver()  # type: ignore[operator]
-    beside = mi.FileResolver(resolver)
-    beside.prepend(str(path.parent))
-    mi.set_file_resolver(beside)  # type: ignore[operator]
-    try:
-        state = parser.parse_file(config, str(path), **values)
-        _check_folders(Path(str(folder)) for folder in list(beside)[:len(beside) - len(resolver)])
-        _check_types(path, state)
-        parser.transform_upgrade(config, state)
-        parser.transform_resolve_references(config, state)
-        _check_content(path, state)
-        _standardise(state, width, height, max_depth)
-        parser.transform_merge_equivalent(config, state)
-        # Not transform_merge_meshes, as mi.load_file: it orders meshes and their emitters by addresses in memory, so that
-        # images differ between processes.  It saves no time of rendering (Veach Ajar, dining-room, classroom).
-        scene = parser.instantiate(config, state)
-        _check_meshes(path, scene)
-        return scene
-    except SceneError:
-        raise
-    except (RuntimeError, ValueError, TypeError) as error:
-        raise SceneError(f"scene file {path}: {_one_line(error)}") from error
-    finally:
-        mi.set_file_resolver(resolver)  # type: ignore[operator]
+class Parsed:
+    """A scene file that has been parsed and checked, as far as this can be done before meshes and images are read.
+
+    Attributes:
+        stated: what it says of its image.
+    """
+
+    def __init__(self, path: Path, parameters: dict[str, Any] | None = None) -> None:
+        """
+        Raises:
+            SceneError: as `load`.
+        """
+        self.path = path
+        values = {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in (parameters or {}).items()}
+        files, known = scenes.read(path, values)
+        if (tag := files[path].root.tag) != "scene":
+            raise SceneError(f"scene file {path}: its root element is <{tag}>, must be Mitsuba 3's <scene>")
+        _check_text(path, files)
+        for key in values:
+            if key not in known:
+                raise SceneError(f"scene file {path} has no parameter '{key}'; "
+                                 f"its <default> parameters: {', '.join(known) or 'none'}{closest(key, known)}")
+        self.config = mi.parser.ParserConfig(str(mi.variant()))
+        self.config.unused_parameters = mi.LogLevel.Debug            # a <default> that nothing uses is no error
+        self.resolver = mi.FileResolver(mi.file_resolver())  # type: ignore[operator]
+        own = len(self.resolver)
+        self.resolver.prepend(str(path.parent))
+        _check_folders(folder for file in files.values() for folder in file.folders)
+        parser: Any = mi.parser
+        with self._finding_files():
+            self.state = parser.parse_file(self.config, str(path), **values)
+            _check_folders(Path(str(folder)) for folder in list(self.resolver)[:len(self.resolver) - own])
+            _check_types(path, self.state)
+            parser.transform_upgrade(self.config, self.state)
+            parser.transform_resolve_references(self.config, self.state)
+            _check_content(path, self.state)
+            try:
+                self.stated = stated(self.state)
+            except SceneError as error:
+                raise SceneError(f"scene file {path}: {error}") from None
+
+    @contextmanager
+    def _finding_files(self) -> Iterator[None]:
+        """Mitsuba looks for files where this scene has them; its errors become one line.
+
+        Raises:
+            SceneError: for those errors.
+        """
+        before = mi.file_resolver()  # type: ignore[operator]
+        mi.set_file_resolver(self.resolver)  # type: ignore[operator]
+        try:
+            yield
+        except SceneError:
+            raise
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise SceneError(f"scene file {self.path}: {_one_line(error)}") from error
+        finally:
+            mi.set_file_resolver(before)  # type: ignore[operator]
+
+    def build(self, width: int | None = None, height: int | None = None, max_depth: int | None = None) -> mi.Scene:
+        """The scene, once: it takes what was parsed.
+
+        Args:
+            width, height, max_depth: as for :func:`load`.
+
+        Raises:
+            SceneError: as `load`.
+        """
+        parser: Any = mi.parser
+        size = {"width": width or self.stated.width, "height": height or self.stated.height}
+        for key, value in size.items():
+            _check_size(key, value)
+        try:
+            film = self.stated.window(**size)
+        except SceneError as error:
+            raise SceneError(f"scene file {self.path}: {error}") from None
+        with self._finding_files():
+            _standardise(self.state, film, self.stated.max_depth if max_depth is None else max_depth,
+                         self.stated.hide_emitters)
+            parser.transform_merge_equivalent(self.config, self.state)
+            # Not transform_merge_meshes, as mi.load_file: it orders meshes and their emitters by addresses in memory, so that
+            # images differ between processes.  It saves no time of rendering (Veach Ajar, dining-room, classroom).
+            scene = parser.instantiate(self.config, self.state)
+            _check_meshes(self.path, scene)
+            return scene
 
 
 def _check_text(path: Path, files: dict[Path, SceneFile]) -> None:
@@ -166,16 +217,17 @@ def _check_content(path: Path, state: Any) -> None:
     ignores it too.
     """
     kind = mi.ObjectType
-    own = [node.props.plugin_name() for _, node in _children(state, state.root, kind.Integrator)]
+    own = [node.props.plugin_name() for _, node in children(state, state.root, kind.Integrator)]
     count = {kind.Sensor: 0, kind.Emitter: 0, kind.Shape: 0}
-    for node in _reachable(state, state.root):
+    media = any(node.type == kind.Medium for node in state.nodes)
+    for node in state.nodes:
         plugin = node.props.plugin_name()
         if node.type in count:
             count[node.type] += 1
         if plugin == "timed_sunsky":
             raise SceneError(f"scene file {path}: emitter 'timed_sunsky' is not supported, for no photons can start "
                              "from it; use 'sunsky'")
-        for key, medium in _children(state, node, kind.Medium) if node.type != kind.Scene else ():
+        for key, medium in children(state, node, kind.Medium) if media and node.type != kind.Scene else ():
             message = (f"scene file {path}: {node.type.name.lower()} '{node.props.id() or plugin}' has the "
                        f"participating medium '{medium.props.plugin_name()}'")
             if own != ["path"] or not _only_absorbs(medium):
@@ -193,30 +245,25 @@ def _only_absorbs(medium: Any) -> bool:
     return colour and all(c == 0 for c in mi.ScalarColor3f(albedo))
 
 
-def _standardise(state: Any, width: int | None, height: int | None, max_depth: int | None) -> None:
+def _standardise(state: Any, film: dict[str, int], max_depth: int, hide_emitters: bool) -> None:
     """Leave the parsed scene one sensor with our film and sampler, and make `path` its integrator."""
-    kind, root = mi.ObjectType, state.root
-    (sensor_key, sensor), *others = _children(state, root, kind.Sensor)
-    integrators = _children(state, root, kind.Integrator)
-    films = _children(state, sensor, kind.Film)
-    said = films[0][1].props if films else mi.Properties()
-    size = {"width": width or said.get("width", 768), "height": height or said.get("height", 576)}  # Mitsuba's defaults
-    for key, value in size.items():
-        _check_size(key, value)
-    if max_depth is None:
-        max_depth = integrators[0][1].props.get("max_depth", -1) if integrators else -1
-    for key, _ in [*films, *_children(state, sensor, kind.Sampler)]:
+    kind = mi.ObjectType
+    (holder, key, sensor), *others = sensors(state)
+    index = holder.props[key].index()
+    for key, _ in [*children(state, sensor, kind.Film), *children(state, sensor, kind.Sampler)]:
         del sensor.props[key]
-    for key, _ in [*others, *integrators]:
-        del root.props[key]
-    del root, sensor, others, films, integrators, said         # appending moves the nodes, which leaves these dangling
+    for holder, key, _ in others:
+        del holder.props[key]
+    for key, _ in children(state, state.root, kind.Integrator):
+        del state.root.props[key]
+    del holder, sensor, others                      # appending moves the nodes, which leaves these dangling
     box = _append(state, kind.ReconstructionFilter, "box")
-    film = _append(state, kind.Film, "hdrfilm", **FILM, **size, standard_filter=box)
+    standard_film = _append(state, kind.Film, "hdrfilm", **FILM, **film, standard_filter=box)
     sampler = _append(state, kind.Sampler, "independent")
-    path = _append(state, kind.Integrator, "path", max_depth=max_depth)
+    path = _append(state, kind.Integrator, "path", max_depth=max_depth, hide_emitters=hide_emitters)
     state.root.props["standard_integrator"] = path
-    sensor_props = state.nodes[state.root.props[sensor_key].index()].props
-    sensor_props["standard_film"], sensor_props["standard_sampler"] = film, sampler
+    sensor_props = state.nodes[index].props
+    sensor_props["standard_film"], sensor_props["standard_sampler"] = standard_film, sampler
 
 
 def _append(state: Any, kind: mi.ObjectType, plugin: str, **properties: Any) -> Any:
@@ -228,19 +275,6 @@ def _append(state: Any, kind: mi.ObjectType, plugin: str, **properties: Any) -> 
         node.props[key] = value
     state.nodes.append(node)
     return mi.Properties.ResolvedReference(len(state.nodes) - 1)
-
-
-def _children(state: Any, node: Any, kind: mi.ObjectType | None = None) -> list[tuple[str, Any]]:
-    """(property name, node) of the objects, of one kind or all, that `node` holds or refers to."""
-    keys = [k for k in node.props.keys() if node.props.type(k) == mi.Properties.Type.ResolvedReference]  # noqa: SIM118
-    children = [(k, state.nodes[node.props[k].index()]) for k in keys]
-    return [(k, child) for k, child in children if kind is None or child.type == kind]
-
-
-def _reachable(state: Any, node: Any) -> Iterator[Any]:
-    yield node
-    for _, child in _children(state, node):
-        yield from _reachable(state, child)
 
 
 def _one_line(error: Exception) -> str:

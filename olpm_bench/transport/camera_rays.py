@@ -34,6 +34,15 @@ def paths_a_lane(sensor: mi.Sensor, spp: int) -> int:
     return paths
 
 
+def sample_ray(sensor: mi.Sensor, time: mi.Float | float, wavelength: mi.Float | float, position: mi.Point2f,
+               aperture: mi.Point2f, active: mi.Bool | bool = True) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """A ray of a sensor, and its weight; Mitsuba's `irradiancemeter` has rays with differentials only (3.9.1)."""
+    if sensor.class_name() != "IrradianceMeter":
+        return sensor.sample_ray(time, wavelength, position, aperture, active)
+    ray, weight = sensor.sample_ray_differential(time, wavelength, position, aperture, active)
+    return mi.Ray3f(ray), weight
+
+
 class CameraRays:
     """Rays of one image, `paths_a_lane` from each lane; consecutive lanes have the same pixel.
 
@@ -78,5 +87,5 @@ class CameraRays:
         time = mi.Float(self.sensor.shutter_open())
         if self.sensor.shutter_open_time() > 0:
             time += sampler.next_1d(active) * self.sensor.shutter_open_time()
-        ray, weight = self.sensor.sample_ray(time, 0, position * self.scale, aperture, active)
+        ray, weight = sample_ray(self.sensor, time, 0, position * self.scale, aperture, active)
         return ray, weight, (self.corner if self.box else position) + self.offset       # of the box, all are alike

@@ -1,6 +1,7 @@
 """A guide: the cache finds the record, the representation holds its density, and this turns both to world space."""
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from dataclasses import fields
@@ -16,6 +17,7 @@ from olpm_bench.transport import headroom, npz, radius
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.estimates import ENOUGH, Estimates
 from olpm_bench.transport.roulette import PixelEstimate
+from olpm_bench.transport.scene_checks import Fingerprint
 from olpm_bench.transport.settings import InputError
 from representations import state as states
 from representations.interface import ParticleBatch
@@ -82,6 +84,7 @@ class Guide:
         self.rows = mi.Float()                  # [n_records * 4] for queries: has seen enough, fraction, outgoing, reflected
         self.pixels: PixelEstimate | None = None        # of the camera that the guide was trained for
         self.particles = 0                      # particles stored over all passes
+        self.scene: Fingerprint | None = None           # that it was trained in; None: not known
         self.wanted = np.zeros(0, np.float32)   # radii that the last measured batch asks for [scene units]
 
     @property
@@ -196,7 +199,7 @@ class Guide:
     def save(self, path: str | Path) -> None:
         """Write the guide to a compressed ``.npz`` file, which takes the place of one that is there when it is whole."""
         meta = {"format": FORMAT, "representation": self.specification, "fraction": self.fraction, "parallax": self.parallax,
-                "particles": self.particles}
+                "particles": self.particles, "scene": self.scene and dataclasses.asdict(self.scene)}
         arrays = {f"cache.{k}": v for k, v in self.cache.to_numpy().items()}
         arrays |= {f"state.{k}": v for k, v in states.to_numpy(self.state).items()}
         arrays |= {f"estimates.{k}": v for k, v in states.to_numpy(self.estimates).items()}
@@ -246,6 +249,7 @@ class Guide:
                 npz.require(np.isfinite(npz.checked(arrays, "pixels", np.float32, h, w)).all() and h * w > 0, "pixels")
                 guide.pixels = PixelEstimate(arrays["pixels"])
             guide.count, guide.particles = mi.UInt32(npz.checked(arrays, "count", np.uint32, guide.records)), particles
+            guide.scene = Fingerprint.from_json(meta.get("scene"))          # older files have none
             guide._tabulate()
             return guide
         except (InputError, representations.RepresentationError) as error:

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench.transport.camera_rays import sample_ray
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
 from olpm_bench.transport.headroom import require
@@ -104,7 +105,7 @@ def emit_photons(scene: mi.Scene, sampler: mi.Sampler) -> ParticleRays:
 
 def emit_importons(sensor: mi.Sensor, sampler: mi.Sampler) -> ParticleRays:
     """Rays through uniform points of the film, weight = importance 1."""
-    ray, weight = sensor.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    ray, weight = sample_ray(sensor, 0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     return evaluated(ray, weight)
 
 

@@ -6,6 +6,7 @@ A unidirectional path tracer with next-event estimation, as Mitsuba's `path`.  T
 """
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -15,6 +16,7 @@ from olpm_bench.transport import roulette
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.camera_rays import CameraRays, paths_a_lane, sums_samples
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.scene_checks import Fingerprint, require_valid_box
 from olpm_bench.transport.settings import IntegratorSettings
 
 if TYPE_CHECKING:
@@ -35,6 +37,8 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
     Args:
         settings: depth, roulette and BSDF fraction.
         guide: from `olpm_bench.train` or `Guide.load`; None traces unguided.
+
+    Emitters that the camera sees directly are black where the scene's own integrator says so, too, by `hide_emitters`.
     """
 
     def __init__(self, settings: IntegratorSettings | None = None, guide: Guide | None = None,
@@ -42,6 +46,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         super().__init__(props or mi.Properties("guided_path"))
         self.settings = settings or IntegratorSettings()
         self.guide = guide
+        self.checked: tuple[mi.Scene, Guide | None] | None = None
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """An image, as `mi.render` asks for it."""
@@ -58,6 +63,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             spp: samples a pixel; 0: as many as the scene asks for.
             log: keeps the vertices; of as many paths as the image has samples.
         """
+        self._check(scene)
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
         with dr.suspend_grad():
             camera = CameraRays(sensor, spp, self.paths_a_lane(sensor, spp))
@@ -78,9 +84,25 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             film.put_block(block)
             return film.develop()
 
+    def _check(self, scene: mi.Scene) -> None:
+        """Once for each scene and guide: refuse what can only give wrong images, and warn of a guide that is of no use.
+
+        Raises:
+            InputError: the scene has lights at infinity and shapes without a valid box.
+        """
+        if self.checked is not None and self.checked[0] is scene and self.checked[1] is self.guide:
+            return
+        require_valid_box(scene)
+        if self.guide is not None and self.guide.scene is not None:
+            difference = Fingerprint.of(scene).difference(self.guide.scene)
+            if difference is not None:
+                warnings.warn(f"the guide was trained in another scene: this one has {difference}; the image is right, but "
+                              "guided by what was learnt elsewhere", stacklevel=3)
+        self.checked = scene, self.guide
+
     def paths_a_lane(self, sensor: mi.Sensor, spp: int) -> int:
         """How many samples of its pixel a lane takes: one without a guide, where more save nothing."""
-        return 1 if self.guide is None or self.hide_emitters else paths_a_lane(sensor, spp)
+        return 1 if self.guide is None else paths_a_lane(sensor, spp)
 
     @staticmethod
     def _splat(block, film, position, value, weight, alpha, ray):
@@ -109,6 +131,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         end_paths, know_worth = self.settings.roulette != "none", pixel is not None
         worth = window * pixel if pixel is not None else mi.Float(0)        # what a path is worth to its pixel
         ctx = mi.BSDFContext()
+        hide_emitters = self.hide_emitters or getattr(scene.integrator(), "hide_emitters", False)
 
         ray = mi.Ray3f(ray)
         L = mi.Spectrum(0)                              # radiance carried to the camera
@@ -120,7 +143,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         si_prev = dr.zeros(mi.Interaction3f)            # the vertex the ray leaves, ...
         pdf_prev = mi.Float(1)                          # ... the density it was continued with,
         delta_prev = mi.Bool(True)                      # ... and whether that was a specular direction
-        valid_ray = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+        valid_ray = mi.Bool(not hide_emitters and scene.environment() is not None)
 
         while active:
             si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=(depth == 0), active=active)
@@ -128,7 +151,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             # ---------------------- Direct emission ----------------------
             ds = mi.DirectionSample3f(scene, si, si_prev)
             emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, active & ~delta_prev)
-            visible = active & ~((depth == 0) & self.hide_emitters)
+            visible = active & ~((depth == 0) & hide_emitters)
             emitted = ds.emitter.eval(si, visible) & visible
             L += beta * mis_weight(pdf_prev, emitter_pdf) * emitted
             if dr.hint(log is not None, mode="scalar"):

@@ -4,17 +4,19 @@
     image = mi.render(scene, integrator=integrator, spp=64)
 
 Its parameters are flat: those of `IntegratorSettings` and `TrainingSettings`, `preset`, `representation` (a name, or
-"unguided"), `seed`, and the hyper-parameters of the representation.  `fraction` holds for camera paths and particles alike.
+"unguided"), `seed`, `progress` (false draws no bar), and the hyper-parameters of the representation.  `fraction` holds for
+camera paths and particles alike.
 """
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import mitsuba as mi
 
 import representations
+from olpm_bench.training_progress import training_progress
 from olpm_bench.transport import settings as options
+from olpm_bench.transport.arguments import distributed, require_type
 from olpm_bench.transport.path import GuidedPathIntegrator
 from olpm_bench.transport.training import train
 
@@ -29,14 +31,18 @@ class GuidedPathPlugin(GuidedPathIntegrator):
         given = {name: props[name] for name in props.keys() if name not in MITSUBA}  # noqa: SIM118
         representation = given.pop("representation", "gaussian_mixture")
         self.training_seed = given.pop("seed", 0)
-        integrator, training = ({f.name: given[f.name] for f in dataclasses.fields(cls) if f.name in given}
-                                for cls in (options.IntegratorSettings, options.TrainingSettings))
+        self.progress = given.pop("progress", True)
         preset = given.pop("preset", "best")
+        require_type("representation", representation, str, "a name")
+        guided = representation != "unguided"
+        integrator, training, *hyper_parameters = distributed(given, options.IntegratorSettings, options.TrainingSettings,
+                                                              representation=representation if guided else None)
+        if "fraction" in integrator:
+            training["fraction"] = integrator["fraction"]
         self.training_settings = options.training(preset, **training)
-        hyper_parameters = {k: v for k, v in given.items() if k not in integrator and k not in training}
         self.specification: dict[str, Any] | None = None
-        if representation != "unguided":
-            self.specification = {"type": representation, **hyper_parameters}
+        if guided:
+            self.specification = {"type": representation, **hyper_parameters[0]}
             representations.create(**self.specification)            # a wrong name or parameter is found here
         super().__init__(options.integrator(preset, **integrator), props=props)
         self.trained_for: tuple[mi.Scene, mi.Sensor] | None = None
@@ -44,8 +50,9 @@ class GuidedPathPlugin(GuidedPathIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         view = scene, scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         if self.specification is not None and self.trained_for != view:
-            self.guide = train(scene, self.specification, self.training_settings, self.settings, seed=self.training_seed,
-                               sensor=view[1])
+            with training_progress(self.progress) as on_pass:
+                self.guide = train(scene, self.specification, self.training_settings, self.settings, seed=self.training_seed,
+                                   sensor=view[1], on_pass=on_pass)
             self.trained_for = view
         return super().render(scene, sensor, seed, spp, develop, evaluate)
 

@@ -30,6 +30,7 @@ from olpm_bench.transport.gather import GATHERS, Gathered, binned, by_record
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
 from olpm_bench.transport.roulette import PixelEstimate
+from olpm_bench.transport.scene_checks import Fingerprint, require_valid_box
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings
 from olpm_bench.transport.view import records_seen
 from olpm_bench.transport.window import by_contribution
@@ -95,7 +96,8 @@ def train(scene: mi.Scene, representation: str | dict[str, Any] = "gaussian_mixt
 def check_traceable(scene: mi.Scene) -> None:
     """
     Raises:
-        InputError: the scene has no emitter or no camera, or a participating medium, which we do not simulate.
+        InputError: the scene has no emitter or no camera, a participating medium, which we do not simulate, or lights at
+            infinity and shapes without a valid box.
     """
     if not scene.emitters():
         raise InputError("the scene has no emitter")
@@ -104,6 +106,7 @@ def check_traceable(scene: mi.Scene) -> None:
     for shape in scene.shapes():
         if shape.is_medium_transition():
             raise InputError(f"shape '{shape.id()}' holds a participating medium; only surfaces can be guided")
+    require_valid_box(scene)
 
 
 def surface_bounds(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
@@ -155,6 +158,7 @@ class Training:
         self.radiance = Guide(RecordCache(bounds, settings.record_radius), specification,
                               integrator.fraction if settings.learn_fraction else None, settings.parallax,
                               settings.learn_direct, settings.inherit)
+        self.radiance.scene = Fingerprint.of(scene)
         self.importance = Guide(RecordCache(bounds, settings.record_radius), specification, parallax=settings.parallax,
                                 inherit=settings.inherit)
         self.integrator = GuidedPathIntegrator(integrator, self.radiance)

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench.transport.camera_rays import sample_ray
 from olpm_bench.transport.guide import MIN_PARTICLES, Guide
 from olpm_bench.transport.guided_bsdf import incident_normal
 
@@ -39,7 +40,7 @@ def records_seen(scene: mi.Scene, guide: Guide, sensor: mi.Sensor | None = None)
     pixel = dr.arange(mi.UInt32, width * height)
     x, y = pixel % dr.opaque(mi.UInt32, width), pixel // dr.opaque(mi.UInt32, width)
     at = mi.Point2f((mi.Float(x) + 0.5) / width, (mi.Float(y) + 0.5) / height)
-    ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+    ray, _ = sample_ray(sensor, 0.0, 0.5, at, mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
     surface = si.is_valid() & mi.has_flag(si.bsdf(ray).flags(), mi.BSDFFlags.Smooth)
     record, _, valid = guide.cache.lookup(si.p, incident_normal(si), si.is_valid())

@@ -285,13 +285,13 @@ def test_no_reference_to_make_is_said(tmp_path):
     assert done.exit_code == 0 and done.stdout.startswith("nothing to make") and not (tmp_path / "results").exists()
 
 
-def test_render_writes_an_image_and_ends_with_json(tmp_path):
+def test_render_writes_an_image_and_one_json_object(tmp_path):
     out = tmp_path / "box.exr"
     result = call("render", "cornell_box", "--method", "unguided", "--set", "scene.light_size=0.4", "--set",
                   "integrator.roulette=none", "--spp", 5, "--width", 16, "--height", 12, "--max-depth", 3, "--seed", 3,
-                  "--out", out)
+                  "--out", out, "--json")
     assert result.exit_code == 0, result.output
-    shown = json.loads(result.stdout.splitlines()[-1])
+    shown = json.loads(result.stdout)
     assert shown["spp"] == 5 and shown["seed"] == 3 and shown["parameters"]["light_size"] == 0.4
     assert shown["integrator"]["roulette"] == "none" and shown["integrator"]["max_depth"] == 3
     assert shown["versions"]["mitsuba"] and shown["train_seconds"] == 0 and shown["charged_seconds"] > 0
@@ -304,13 +304,13 @@ def test_render_says_what_could_not_be_learnt(tmp_path, monkeypatch):
     from olpm_bench.bench import render_one
 
     monkeypatch.setattr(render_one, "render", lambda *_, **__: {"warnings": ["no camera path has met light"], "trained": 0.3})
-    result = call("render", "cornell_box", "--method", "jensen", "--spp", 1, "--out", tmp_path / "x.exr")
+    result = call("render", "cornell_box", "--method", "jensen", "--spp", 1, "--json", "--out", tmp_path / "x.exr")
     assert result.exit_code == 0 and "olpm-bench: no camera path has met light\n" in result.stderr
     assert "olpm-bench: only 30% of the surfaces" in result.stderr and json.loads(result.stdout)["trained"] == 0.3
 
 
 def test_a_guide_is_saved_and_used_again(tmp_path):
-    options = ("--method", "cosine", "--spp", 2, "--width", 16, "--height", 12, "--max-depth", 3)
+    options = ("--method", "cosine", "--json", "--spp", 2, "--width", 16, "--height", 12, "--max-depth", 3)
     training = ("--set", "training.passes=1", "--set", "training.photons=500", "--set", "training.importons=100",
                 "--set", "training.camera_passes=2", "--set", "training.camera_paths=200",
                 "--set", "training.blend=false")
@@ -319,7 +319,7 @@ def test_a_guide_is_saved_and_used_again(tmp_path):
     assert first.exit_code == 0, first.output
     again = call("render", "cornell_box", *options, "--out", tmp_path / "b.exr", "--load-guide", guide)
     assert again.exit_code == 0, again.output
-    trained, loaded = (json.loads(r.stdout.splitlines()[-1]) for r in (first, again))
+    trained, loaded = (json.loads(r.stdout) for r in (first, again))
     assert trained["train_seconds"] > 0 and loaded["train_seconds"] == 0 and loaded["records"] == trained["records"] > 0
     header = read_exr(tmp_path / "b.exr")[1]
     assert trained["training"]["photons"] == read_exr(tmp_path / "a.exr")[1]["training"]["photons"] == 500

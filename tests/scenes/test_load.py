@@ -283,3 +283,39 @@ def test_a_scene_of_one_room_has_none_to_tell_apart():
     assert scenes.rooms("cornell_box") is None
     with pytest.raises(SceneError, match="no parameter 'gap'"):
         scenes.rooms("cornell_box", {"gap": 1})
+
+
+def test_files_are_found_in_the_folders_of_path_elements(tmp_path: Path):
+    """As Mitsuba finds them: the last <path> first, that of an include by the include alone."""
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+    lamp = '<shape type="sphere"><emitter type="area"><spectrum name="radiance" filename="lamp.spd"/></emitter></shape>'
+    for value, name in enumerate(["", "a", "b", "c"], 1):
+        (tmp_path / name).mkdir(exist_ok=True)
+        mi.Bitmap(np.full((2, 4, 3), value, np.float32)).write(str(tmp_path / name / "sky.exr"))
+        (tmp_path / name / "lamp.spd").write_text(f"400 {value}\n700 {value}\n")
+    (tmp_path / "c" / "part.xml").write_text(f'<scene version="3.0.0"><path value="c"/>{lamp}</scene>')
+    (tmp_path / "c" / "c").mkdir()
+    (tmp_path / "c" / "c" / "lamp.spd").write_text("400 9\n700 9\n")
+
+    def found(*parts: str) -> tuple[float, float]:
+        file = xml(tmp_path, SENSOR, *parts)
+        scene, theirs = load(file), mi.load_file(str(file), optimize=False)
+        values = [(float(np.mean(mi.traverse(s.shapes()[0].emitter())["radiance.value"].numpy())),
+                   float(np.mean(mi.traverse(s.environment())["data"].numpy()))) for s in (scene, theirs)]
+        np.testing.assert_allclose(*values)
+        return values[0]
+
+    assert found(lamp, sky)[1] == pytest.approx(1)
+    ones = [found(lamp, '<path value="a"/>', '<path value="b"/>', sky), found('<path value="a"/>', lamp, sky)]
+    assert [sky for _, sky in ones] == pytest.approx([3, 2])
+    assert ones[1][0] / ones[0][0] == pytest.approx(2)                      # before and after the path
+    nine = found('<path value="c"/>', '<include filename="part.xml"/>', sky)
+    assert nine[1] == pytest.approx(4) and nine[0] / ones[0][0] == pytest.approx(9)
+
+    file = xml(tmp_path, SENSOR, '<path value="a"/>', lamp, sky)
+    before = scenes.digest(file)
+    for folder, changes in (("", False), ("b", False), ("a", True)):
+        (tmp_path / folder / "lamp.spd").write_text("400 7\n700 7\n")
+        assert (scenes.digest(file) != before) == changes
+    with pytest.raises(SceneError, match=r"scene\.xml: <path>: there is no folder 'nowhere'"):
+        load(xml(tmp_path, SENSOR, SHAPE, EMITTER, '<path value="nowhere"/>'))

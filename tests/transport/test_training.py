@@ -229,7 +229,7 @@ def test_plugin_trains_once_a_scene(scene):
 
 @pytest.mark.parametrize(("given", "message"), [
     ({"passes": -1}, "passes = -1: must be >= 0"),
-    ({"roulete": "none"}, "representation 'gaussian_mixture' has no parameter 'roulete'"),
+    ({"roulete": "none"}, r"unknown setting 'roulete'; known: .*; did you mean 'roulette'\?"),
     ({"representation": "gmmm"}, "unknown representation 'gmmm'"),
     ({"preset": "slow"}, "unknown preset 'slow'"),
 ])
