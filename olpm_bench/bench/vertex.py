@@ -24,6 +24,7 @@ from olpm_bench.transport.camera_paths import wanted
 from olpm_bench.transport.gather import Gathered
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
+from olpm_bench.transport.mis import mis_weight
 from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError, IntegratorSettings
 from representations import square
 
@@ -154,7 +155,7 @@ def truth(scene: mi.Scene, vertex: Vertex, integrator: IntegratorSettings, guide
         guide: guides the paths from their next vertex on; the result is unbiased with any, and without.
         on_pass: called with the share of the passes done.
     """
-    from olpm_bench.transport.path import GuidedPathIntegrator, mis_weight
+    from olpm_bench.transport.path import GuidedPathIntegrator
 
     depth = integrator.max_depth if integrator.max_depth >= 0 else UNBOUNDED_DEPTH
     props = mi.Properties("guided_path")

@@ -24,6 +24,7 @@ import numpy as np
 
 from olpm_bench.transport.cache import MISSING
 from olpm_bench.transport.guide import MIN_PARTICLES
+from olpm_bench.transport.mis import balance_weight, density
 from olpm_bench.transport.particles import Departures, ParticleRays, evaluated
 from representations import discrete, square
 from representations import state as states
@@ -122,7 +123,7 @@ class EmissionGuide:
             return mi.Spectrum(0), mi.Float(0)
         ds = mi.DirectionSample3f(self.scene, si, dr.zeros(mi.Interaction3f))
         em_pdf = self.scene.pdf_emitter_direction(dr.zeros(mi.Interaction3f), ds, active)
-        return ds.emitter.eval(si, active), pdf / (pdf + em_pdf)
+        return ds.emitter.eval(si, active), balance_weight(pdf, em_pdf)
 
     # ---------------------- Learning ----------------------
 
@@ -265,7 +266,7 @@ class EmissionGuide:
         from_center -= d * dr.dot(from_center, d)
         ds.d = d
         own_pdf = dr.select(dr.norm(from_center) <= self.disk * (1 + 1e-5), 1 / (dr.pi * dr.square(self.disk)), 0)
-        own_pdf *= dr.select(environment, emitter.pdf_direction(nowhere, ds, environment), 1)
+        own_pdf *= dr.select(environment, density(emitter.pdf_direction(nowhere, ds, environment)), 1)
         pdf = own_pdf
         if self.learnt:
             guided_pdf = self._position_pdf(x, d, record)

@@ -21,6 +21,7 @@ import numpy as np
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
 from olpm_bench.transport.headroom import require
+from olpm_bench.transport.mis import balance_weight
 from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError
 from olpm_bench.transport.window import HEAVIEST, HIGH, LEAST_SURVIVAL, LIGHTEST, LOW, Window
 
@@ -234,7 +235,7 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
             ds, radiance = scene.sample_emitter_direction(si, sampler.next_2d(connect), True, connect)
             light = emission.index(ds.emitter)
             value, pdf = bsdf.eval_pdf(ctx, si.to_local(ds.d), connect & (ds.pdf > 0))
-            mis = dr.select(ds.delta, 1, ds.pdf / (ds.pdf + pdf))
+            mis = dr.select(ds.delta, 1, balance_weight(ds.pdf, pdf))
             connect &= (ds.pdf > 0) & (light < len(emission.lights))
             escape = active & ~si.is_valid() & (depth >= 2) & room_left
             ray_radiance, ray_mis = emission.escape(si, pdf_prev, escape)

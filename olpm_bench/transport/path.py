@@ -15,18 +15,11 @@ from olpm_bench.transport import roulette
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.camera_rays import CameraRays, paths_a_lane, sums_samples
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.mis import mis_weight, power_heuristic, relative_density
 from olpm_bench.transport.settings import IntegratorSettings
 
 if TYPE_CHECKING:
     from olpm_bench.transport.guide import Guide
-
-
-def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """Power heuristic for a sample of technique a (Veach 1997); 0 where technique a can't make it.
-
-    By the ratio of the densities: their squares overflow where a rough interface is nearly specular.
-    """
-    return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(pdf_b / pdf_a)), 0)
 
 
 class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
@@ -130,9 +123,10 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, active & ~delta_prev)
             visible = active & ~((depth == 0) & self.hide_emitters)
             emitted = ds.emitter.eval(si, visible) & visible
-            L += beta * mis_weight(pdf_prev, emitter_pdf) * emitted
+            nee = relative_density(pdf_prev, emitter_pdf)       # how densely next-event estimation finds it
+            L += beta * power_heuristic(nee) * emitted
             if dr.hint(log is not None, mode="scalar"):
-                log.arrive(path, depth, ray, si.t, emitted, emitter_pdf / pdf_prev, active)
+                log.arrive(path, depth, ray, si.t, emitted, nee, active)
 
             # Emitters on the surface are hit even at the last depth; everything below needs one more segment.
             active_next = active & si.is_valid() & (depth + 1 < max_depth)
@@ -141,7 +135,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
             # ---------------------- Emitter sampling ----------------------
             active_em = active_next & bsdf.smooth
             ds, weight_em = scene.sample_emitter_direction(si, sampler.next_2d(active_em), True, active_em)
-            active_em &= ds.pdf != 0
+            active_em &= ds.pdf > 0
 
             # ------ Value of the emitter's direction, and the continuation ------
             value, pdf_em, bs, weight = bsdf.eval_pdf_sample(
