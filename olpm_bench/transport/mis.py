@@ -1,8 +1,9 @@
 """Multiple importance sampling: the weights of two techniques that can make the same direction (Veach 1997).
 
-Densities come from BSDFs, emitters and representations, which other people write too.  Mitsuba's black environment map
-answers NaN, for one.  `density` says what each odd value counts as, and everything that weighs by a density goes through
-it, so that the weights of two techniques always add up to 1 where one of them can make the direction.
+Densities come from BSDFs, emitters and representations, which other people write too.  Mitsuba's black
+environment map answers NaN, for one.  `density` says what each odd value counts as, and everything that
+weighs by a density goes through it, so that the weights of two techniques always add up to 1 where one of
+them can make the direction.
 """
 from __future__ import annotations
 
@@ -11,20 +12,22 @@ import mitsuba as mi
 
 
 def density(pdf: mi.Float) -> mi.Float:
-    """A density as far as it can be used: NaN and negative values count as 0, infinity as the largest finite number."""
+    """A density as far as it can be used.
+
+    NaN and negative values count as 0, infinity as the largest finite number.
+    """
     return dr.select(pdf > 0, dr.minimum(pdf, dr.largest(mi.Float)), 0)
 
 
 def relative_density(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """How many times as densely as technique a technique b makes a direction; infinite where a can't make it."""
-    a = density(pdf_a)
-    return dr.select(a > 0, density(pdf_b) / a, dr.inf)
+    """How many times as densely technique b makes a direction as technique a; infinite where a can't."""
+    return dr.select(pdf_a > 0, density(pdf_b) / dr.minimum(pdf_a, dr.largest(mi.Float)), dr.inf)
 
 
 def power_heuristic(relative: mi.Float) -> mi.Float:
     """Weight of a sample of technique a by the power heuristic, from the `relative_density` of technique b.
 
-    By the ratio of the densities: their squares overflow where a rough interface is nearly specular.
+    It takes the ratio of the densities: their squares overflow where a rough interface is nearly specular.
     """
     return dr.rcp(1 + dr.square(relative))
 

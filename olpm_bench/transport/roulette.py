@@ -43,9 +43,10 @@ class PixelEstimate:
 
 
 def by_throughput(beta: mi.Spectrum, eta: mi.Float, deep: mi.Bool) -> mi.Float:
-    """Survival probability after scattering, as in Mitsuba's `path`: `eta` cancels the square that refraction multiplies with.
+    """Survival probability after scattering, as in Mitsuba's `path`.
 
-    Where a BSDF's `eta` or value is NaN, the path goes on: an end that nothing makes up for would be a bias.
+    `eta` cancels the square that refraction multiplies with.  Where a BSDF's `eta` or value is NaN, the path
+    goes on: an end that nothing makes up for would be a bias.
     """
     survival = dr.max(beta) * dr.square(eta)
     return dr.select(deep & (survival < MOST), survival, dr.select(deep, mi.Float(MOST), 1))
@@ -54,8 +55,8 @@ def by_throughput(beta: mi.Spectrum, eta: mi.Float, deep: mi.Bool) -> mi.Float:
 def by_contribution(beta: mi.Spectrum, outgoing: mi.Float, worth: mi.Float, depth: mi.UInt32) -> mi.Float:
     """Survival probability before scattering: expected contribution over what is `worth` a path; see above.
 
-    Paths without limit must end somewhere, though between white walls they may stay worth their while.  A contribution that is
-    NaN, 0 / 0 or infinity times 0, counts as none.
+    Paths without limit must end somewhere, though between white walls they may stay worth their while.  A
+    contribution that is NaN, 0 / 0 or infinity times 0, counts as none.
     """
     contribution = mi.luminance(beta) * outgoing / worth
     most = dr.select(depth < UNBOUNDED_DEPTH, mi.Float(1), MOST)
