@@ -20,11 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench.transport import mis
 from olpm_bench.transport.camera_paths import wanted
 from olpm_bench.transport.gather import Gathered
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
-from olpm_bench.transport.mis import mis_weight
 from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError, IntegratorSettings
 from representations import square
 
@@ -162,6 +162,7 @@ def truth(scene: mi.Scene, vertex: Vertex, integrator: IntegratorSettings, guide
     props["hide_emitters"] = True                   # at the first vertex: added below with their weight
     tracer = GuidedPathIntegrator(replace(integrator, roulette="none", max_depth=depth - vertex.number), guide, props)
     sampler, n = mi.load_dict({"type": "independent"}), bins * bins * STRATA * STRATA
+    lights = tracer.light_sampling(scene)
     found = Truth(np.zeros((passes, bins * bins)), np.zeros((passes, bins * bins)), passes * STRATA * STRATA)
     for index in range(passes):
         sampler.seed(dr.opaque(mi.UInt32, int(np.random.SeedSequence((seed, index)).generate_state(1)[0])), n)
@@ -169,13 +170,14 @@ def truth(scene: mi.Scene, vertex: Vertex, integrator: IntegratorSettings, guide
         ray, si = vertex.interaction(scene, n)
         bsdf, wo = si.bsdf(ray), vertex.to_world(local)
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(wo), True)
-        onward = si.spawn_ray(wo)
+        onward = lights.origins.spawn(si, wo)
         # ---------------------- Emitters, with the share that the guide is to learn ----------------------
         hit = scene.ray_intersect(onward)
         ds = mi.DirectionSample3f(scene, hit, si)
-        emitted, nee = ds.emitter.eval(hit, True), scene.pdf_emitter_direction(si, ds, True)
+        emitted, nee = ds.emitter.eval(hit, True), mis.density(lights.pdf(si, hit, ds, True))
         known = GuidedBSDF(si.bsdf(ray), si, guide, integrator.fraction, True).reflected
-        share = dr.select(known > 0, wanted(nee, mi.luminance(value * emitted), known), mis_weight(pdf, nee))
+        learnt = wanted(nee, mi.luminance(value * emitted), known)
+        share = dr.select(known > 0, learnt, mis.mis_weight(pdf, nee))
         # ---------------------- All other light ----------------------
         with dr.suspend_grad():
             indirect, _, _ = tracer.walk(scene, sampler, onward, True)

@@ -24,6 +24,7 @@ import numpy as np
 
 from olpm_bench.transport.cache import MISSING
 from olpm_bench.transport.guide import MIN_PARTICLES
+from olpm_bench.transport.light_sampling import LightSampling
 from olpm_bench.transport.mis import balance_weight, density
 from olpm_bench.transport.particles import Departures, ParticleRays, evaluated
 from representations import discrete, square
@@ -67,6 +68,7 @@ class EmissionGuide:
     def __init__(self, scene: mi.Scene, bounds: mi.ScalarBoundingBox3f, fraction: float) -> None:
         self.scene, self.fraction = scene, fraction
         self.lights = distant_lights(scene)
+        self.light_sampling = LightSampling(scene)
         self.has_environment = self.lights[0].is_environment()
         self.center = mi.Point3f([dr.opaque(mi.Float, float(x)) for x in np.array(bounds.center()).ravel()])
         self.radius = 0.5 * float(dr.norm(bounds.extents())) * (1 + 1e-4)           # [scene units]
@@ -241,7 +243,7 @@ class EmissionGuide:
         sample2, sample3 = sampler.next_2d(), sampler.next_2d()
         light = self.index(emitter)
         distant = light < len(self.lights)
-        ray, weight = emitter.sample_ray(0.0, sample1, sample2, sample3, ~distant)
+        ray, weight = self.light_sampling.sample_ray(emitter, sample1, sample2, sample3, ~distant)
 
         # ---------------------- The light's own sampler ----------------------
         nowhere = dr.zeros(mi.Interaction3f, dr.width(light))

@@ -15,6 +15,7 @@ from olpm_bench.transport import roulette
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.camera_rays import CameraRays, paths_a_lane, sums_samples
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.light_sampling import LightSampling
 from olpm_bench.transport.mis import mis_weight, power_heuristic, relative_density
 from olpm_bench.transport.settings import IntegratorSettings
 
@@ -35,6 +36,13 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         super().__init__(props or mi.Properties("guided_path"))
         self.settings = settings or IntegratorSettings()
         self.guide = guide
+        self.lights: LightSampling | None = None        # of the scene that was rendered last
+
+    def light_sampling(self, scene: mi.Scene) -> LightSampling:
+        """Of a scene, whose emitters and bounds are looked at once."""
+        if self.lights is None or self.lights.scene != scene:
+            self.lights = LightSampling(scene)
+        return self.lights
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """An image, as `mi.render` asks for it."""
@@ -101,7 +109,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         paths = camera.paths_a_lane if camera is not None else 1
         end_paths, know_worth = self.settings.roulette != "none", pixel is not None
         worth = window * pixel if pixel is not None else mi.Float(0)        # what a path is worth to its pixel
-        ctx = mi.BSDFContext()
+        ctx, lights = mi.BSDFContext(), self.light_sampling(scene)
 
         ray = mi.Ray3f(ray)
         L = mi.Spectrum(0)                              # radiance carried to the camera
@@ -120,7 +128,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
 
             # ---------------------- Direct emission ----------------------
             ds = mi.DirectionSample3f(scene, si, si_prev)
-            emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, active & ~delta_prev)
+            emitter_pdf = lights.pdf(si_prev, si, ds, active & ~delta_prev)
             visible = active & ~((depth == 0) & self.hide_emitters)
             emitted = ds.emitter.eval(si, visible) & visible
             nee = relative_density(pdf_prev, emitter_pdf)       # how densely next-event estimation finds it
@@ -134,7 +142,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
 
             # ---------------------- Emitter sampling ----------------------
             active_em = active_next & bsdf.smooth
-            ds, weight_em = scene.sample_emitter_direction(si, sampler.next_2d(active_em), True, active_em)
+            ds, weight_em = lights.sample(si, sampler.next_2d(active_em), active_em)
             active_em &= ds.pdf > 0
 
             # ------ Value of the emitter's direction, and the continuation ------
@@ -162,7 +170,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
                 log.leave(path, depth, si, bsdf, bs, weight, survive, reflected, active & si.is_valid())
 
             # ---------------------- Update loop variables ----------------------
-            ray = si.spawn_ray(si.to_world(bs.wo))
+            ray = lights.origins.spawn(si, si.to_world(bs.wo))
             beta *= weight
             eta *= bs.eta
             si_prev = dr.detach(mi.Interaction3f(si), True)
