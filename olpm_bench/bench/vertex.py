@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench.transport import mis
 from olpm_bench.transport.camera_paths import wanted
 from olpm_bench.transport.camera_rays import sample_ray
 from olpm_bench.transport.gather import Gathered
@@ -155,13 +156,14 @@ def truth(scene: mi.Scene, vertex: Vertex, integrator: IntegratorSettings, guide
         guide: guides the paths from their next vertex on; the result is unbiased with any, and without.
         on_pass: called with the share of the passes done.
     """
-    from olpm_bench.transport.path import GuidedPathIntegrator, mis_weight
+    from olpm_bench.transport.path import GuidedPathIntegrator
 
     depth = integrator.max_depth if integrator.max_depth >= 0 else UNBOUNDED_DEPTH
     props = mi.Properties("guided_path")
     props["hide_emitters"] = True                   # at the first vertex: added below with their weight
     tracer = GuidedPathIntegrator(replace(integrator, roulette="none", max_depth=depth - vertex.number), guide, props)
     sampler, n = mi.load_dict({"type": "independent"}), bins * bins * STRATA * STRATA
+    lights = tracer.light_sampling(scene)
     found = Truth(np.zeros((passes, bins * bins)), np.zeros((passes, bins * bins)), passes * STRATA * STRATA)
     for index in range(passes):
         sampler.seed(dr.opaque(mi.UInt32, int(np.random.SeedSequence((seed, index)).generate_state(1)[0])), n)
@@ -169,13 +171,14 @@ def truth(scene: mi.Scene, vertex: Vertex, integrator: IntegratorSettings, guide
         ray, si = vertex.interaction(scene, n)
         bsdf, wo = si.bsdf(ray), vertex.to_world(local)
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(wo), True)
-        onward = si.spawn_ray(wo)
+        onward = lights.origins.spawn(si, wo)
         # ---------------------- Emitters, with the share that the guide is to learn ----------------------
         hit = scene.ray_intersect(onward)
         ds = mi.DirectionSample3f(scene, hit, si)
-        emitted, nee = ds.emitter.eval(hit, True), scene.pdf_emitter_direction(si, ds, True)
+        emitted, nee = ds.emitter.eval(hit, True), mis.density(lights.pdf(si, hit, ds, True))
         known = GuidedBSDF(si.bsdf(ray), si, guide, integrator.fraction, True).reflected
-        share = dr.select(known > 0, wanted(nee, mi.luminance(value * emitted), known), mis_weight(pdf, nee))
+        learnt = wanted(nee, mi.luminance(value * emitted), known)
+        share = dr.select(known > 0, learnt, mis.mis_weight(pdf, nee))
         # ---------------------- All other light ----------------------
         with dr.suspend_grad():
             indirect, _, _ = tracer.walk(scene, sampler, onward, True)

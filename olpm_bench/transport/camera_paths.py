@@ -22,6 +22,7 @@ import mitsuba as mi
 
 from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
 from olpm_bench.transport.headroom import require
+from olpm_bench.transport.mis import power_heuristic
 from olpm_bench.transport.particles import Particles, places
 from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError
 
@@ -134,7 +135,7 @@ class CameraPaths:
         path = self.first + path * self.a_sample
         place = depth * self.n + path
         n = dr.select(bsdf.smooth, incident_normal(si), 0)
-        learnable = (dr.max(weight) > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        learnable = (dr.max(weight) > 0) & (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         cosine = dr.maximum(dr.dot(n, si.to_world(bs.wo)), 0)
         per_pdf = dr.select(learnable, cosine / (bs.pdf * survive), 0)
         dr.scatter(self.position, mi.Vector4f(si.p.x, si.p.y, si.p.z, 0), place, active)
@@ -156,7 +157,7 @@ class CameraPaths:
             reflected = dr.gather(mi.Vector4f, self.reflected, place)
             emitted = dr.gather(mi.Vector4f, self.emitted, place)
             source, factor = mi.Spectrum(emitted.x, emitted.y, emitted.z), mi.Spectrum(weight.x, weight.y, weight.z)
-            mis = dr.rcp(1 + dr.square(emitted.w))
+            mis = power_heuristic(emitted.w)
             value = mi.luminance(factor * source)
             share = mis * dr.select(reflected.w > 0, wanted(emitted.w, value, reflected.w), 1)
             returned = factor * (source * mis + radiance)

@@ -24,6 +24,8 @@ import numpy as np
 
 from olpm_bench.transport.cache import MISSING
 from olpm_bench.transport.guide import MIN_PARTICLES
+from olpm_bench.transport.light_sampling import LightSampling
+from olpm_bench.transport.mis import balance_weight, density
 from olpm_bench.transport.particles import Departures, ParticleRays, evaluated
 from representations import discrete, square
 from representations import state as states
@@ -66,6 +68,7 @@ class EmissionGuide:
     def __init__(self, scene: mi.Scene, bounds: mi.ScalarBoundingBox3f, fraction: float) -> None:
         self.scene, self.fraction = scene, fraction
         self.lights = distant_lights(scene)
+        self.light_sampling = LightSampling(scene)
         self.has_environment = self.lights[0].is_environment()
         self.center = mi.Point3f([dr.opaque(mi.Float, float(x)) for x in np.array(bounds.center()).ravel()])
         self.radius = 0.5 * float(dr.norm(bounds.extents())) * (1 + 1e-4)           # [scene units]
@@ -122,7 +125,7 @@ class EmissionGuide:
             return mi.Spectrum(0), mi.Float(0)
         ds = mi.DirectionSample3f(self.scene, si, dr.zeros(mi.Interaction3f))
         em_pdf = self.scene.pdf_emitter_direction(dr.zeros(mi.Interaction3f), ds, active)
-        return ds.emitter.eval(si, active), pdf / (pdf + em_pdf)
+        return ds.emitter.eval(si, active), balance_weight(pdf, em_pdf)
 
     # ---------------------- Learning ----------------------
 
@@ -240,7 +243,7 @@ class EmissionGuide:
         sample2, sample3 = sampler.next_2d(), sampler.next_2d()
         light = self.index(emitter)
         distant = light < len(self.lights)
-        ray, weight = emitter.sample_ray(0.0, sample1, sample2, sample3, ~distant)
+        ray, weight = self.light_sampling.sample_ray(emitter, sample1, sample2, sample3, ~distant)
 
         # ---------------------- The light's own sampler ----------------------
         nowhere = dr.zeros(mi.Interaction3f, dr.width(light))
@@ -265,7 +268,7 @@ class EmissionGuide:
         from_center -= d * dr.dot(from_center, d)
         ds.d = d
         own_pdf = dr.select(dr.norm(from_center) <= self.disk * (1 + 1e-5), 1 / (dr.pi * dr.square(self.disk)), 0)
-        own_pdf *= dr.select(environment, emitter.pdf_direction(nowhere, ds, environment), 1)
+        own_pdf *= dr.select(environment, density(emitter.pdf_direction(nowhere, ds, environment)), 1)
         pdf = own_pdf
         if self.learnt:
             guided_pdf = self._position_pdf(x, d, record)

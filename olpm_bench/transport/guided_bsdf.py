@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
+from olpm_bench.transport.mis import density
+
 if TYPE_CHECKING:
     from olpm_bench.transport.guide import Guide, GuidedPoint
 
@@ -87,7 +89,7 @@ class GuidedBSDF:
 
     def _mixture_pdf(self, bsdf_pdf: mi.Float, wo: mi.Vector3f) -> mi.Float:
         assert self.guided is not None
-        guide_pdf = self.guided.pdf(self.si.to_world(wo))
+        guide_pdf, bsdf_pdf = density(self.guided.pdf(self.si.to_world(wo))), density(bsdf_pdf)
         return dr.select(self.guided.valid, dr.lerp(guide_pdf, bsdf_pdf, self.fraction), bsdf_pdf)
 
     def _one_sample(self, ctx: mi.BSDFContext, choose_bsdf: mi.Bool, bs: mi.BSDFSample3f, weight: mi.Spectrum,
@@ -100,8 +102,8 @@ class GuidedBSDF:
         value, bsdf_pdf = self.bsdf.eval_pdf(ctx, self.si, wo, found)
         # The BSDF's proposal; a specular one is no density and is not mixed.
         specular = choose_bsdf & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        value = dr.select(choose_bsdf, weight * bs.pdf, value)
-        bsdf_pdf = dr.select(choose_bsdf, bs.pdf, bsdf_pdf)
+        bsdf_pdf = density(dr.select(choose_bsdf, bs.pdf, bsdf_pdf))
+        value = dr.select(choose_bsdf, weight * bsdf_pdf, value)
 
         bs.wo = dr.select(choose_bsdf, bs.wo, wo)
         bs.eta = dr.select(choose_bsdf, bs.eta, 1)      # on the record's side of the surface; only roulette reads it

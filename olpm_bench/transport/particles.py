@@ -22,6 +22,9 @@ from olpm_bench.transport.camera_rays import sample_ray
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
 from olpm_bench.transport.headroom import require
+from olpm_bench.transport.light_sampling import LightSampling
+from olpm_bench.transport.mis import balance_weight
+from olpm_bench.transport.ray_origins import RayOrigins
 from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError
 from olpm_bench.transport.window import HEAVIEST, HIGH, LEAST_SURVIVAL, LIGHTEST, LOW, Window
 
@@ -93,14 +96,17 @@ class Particles:
         return np.stack([count, total ** 2 / np.maximum(squares, np.finfo(float).tiny)], 1)
 
 
-def emit_photons(scene: mi.Scene, sampler: mi.Sampler) -> ParticleRays:
+def emit_photons(scene: mi.Scene, sampler: mi.Sampler, lights: LightSampling | None = None) -> ParticleRays:
     """Rays that leave the emitters, weight = flux (radiance over density).
+
+    Args:
+        lights: of the scene, for those who have it.
 
     Raises:
         InputError: an emitter gives NaN, infinite or negative radiance.
     """
-    ray, weight, _ = scene.sample_emitter_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), True)
-    return evaluated(ray, weight)
+    lights = lights or LightSampling(scene)
+    return evaluated(*lights.sample_photon(sampler.next_1d(), sampler.next_2d(), sampler.next_2d()))
 
 
 def emit_importons(sensor: mi.Sensor, sampler: mi.Sampler) -> ParticleRays:
@@ -186,7 +192,7 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         raise InputError(f"{n_paths} particles of up to {2 * hits} hits in one trace: at most {(2 ** 32 - 1) // (8 * hits)}")
     require(3 * 16 * rows * lanes, f"{n_paths} particles of up to {2 * hits} hits in one trace", "trace fewer")
     photons = mode == mi.TransportMode.Importance
-    ctx = mi.BSDFContext(mode)
+    ctx, origins = mi.BSDFContext(mode), RayOrigins(scene)
     position, direction, normal = (dr.empty(mi.Float, 4 * rows * lanes) for _ in range(3))
     left_at, left_for = (dr.empty(mi.Float, 4 * (DEPARTURES * each * lanes if emission else 1)) for _ in range(2))
     # Opaque: counts are data, not code.
@@ -235,7 +241,7 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
             ds, radiance = scene.sample_emitter_direction(si, sampler.next_2d(connect), True, connect)
             light = emission.index(ds.emitter)
             value, pdf = bsdf.eval_pdf(ctx, si.to_local(ds.d), connect & (ds.pdf > 0))
-            mis = dr.select(ds.delta, 1, ds.pdf / (ds.pdf + pdf))
+            mis = dr.select(ds.delta, 1, balance_weight(ds.pdf, pdf))
             connect &= (ds.pdf > 0) & (light < len(emission.lights))
             escape = active & ~si.is_valid() & (depth >= 2) & room_left
             ray_radiance, ray_mis = emission.escape(si, pdf_prev, escape)
@@ -281,7 +287,7 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         alive = scatter & (dr.max(weight) > 0)
         if dr.hint(emission is not None, mode="scalar"):
             pdf_prev = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.largest(mi.Float), bs.pdf)
-        ray = si.spawn_ray(d)
+        ray = origins.spawn(si, d)
 
         # ---------------------- Go on, or with a copy in waiting, or with the next path ----------------------
         ended = active & ~alive

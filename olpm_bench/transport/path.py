@@ -16,19 +16,13 @@ from olpm_bench.transport import roulette
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.camera_rays import CameraRays, paths_a_lane, sums_samples
 from olpm_bench.transport.guided_bsdf import GuidedBSDF
+from olpm_bench.transport.light_sampling import LightSampling
+from olpm_bench.transport.mis import mis_weight, power_heuristic, relative_density
 from olpm_bench.transport.scene_checks import Fingerprint, require_valid_box
 from olpm_bench.transport.settings import IntegratorSettings
 
 if TYPE_CHECKING:
     from olpm_bench.transport.guide import Guide
-
-
-def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """Power heuristic for a sample of technique a (Veach 1997); 0 where technique a can't make it.
-
-    By the ratio of the densities: their squares overflow where a rough interface is nearly specular.
-    """
-    return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(pdf_b / pdf_a)), 0)
 
 
 class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
@@ -47,6 +41,13 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         self.settings = settings or IntegratorSettings()
         self.guide = guide
         self.checked: tuple[mi.Scene, Guide | None] | None = None
+        self.lights: LightSampling | None = None        # of the scene that was rendered last
+
+    def light_sampling(self, scene: mi.Scene) -> LightSampling:
+        """Of a scene, whose emitters and bounds are looked at once."""
+        if self.lights is None or self.lights.scene != scene:
+            self.lights = LightSampling(scene)
+        return self.lights
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """An image, as `mi.render` asks for it."""
@@ -130,7 +131,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
         paths = camera.paths_a_lane if camera is not None else 1
         end_paths, know_worth = self.settings.roulette != "none", pixel is not None
         worth = window * pixel if pixel is not None else mi.Float(0)        # what a path is worth to its pixel
-        ctx = mi.BSDFContext()
+        ctx, lights = mi.BSDFContext(), self.light_sampling(scene)
         hide_emitters = self.hide_emitters or getattr(scene.integrator(), "hide_emitters", False)
 
         ray = mi.Ray3f(ray)
@@ -150,12 +151,13 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
 
             # ---------------------- Direct emission ----------------------
             ds = mi.DirectionSample3f(scene, si, si_prev)
-            emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, active & ~delta_prev)
+            emitter_pdf = lights.pdf(si_prev, si, ds, active & ~delta_prev)
             visible = active & ~((depth == 0) & hide_emitters)
             emitted = ds.emitter.eval(si, visible) & visible
-            L += beta * mis_weight(pdf_prev, emitter_pdf) * emitted
+            nee = relative_density(pdf_prev, emitter_pdf)       # how densely next-event estimation finds it
+            L += beta * power_heuristic(nee) * emitted
             if dr.hint(log is not None, mode="scalar"):
-                log.arrive(path, depth, ray, si.t, emitted, emitter_pdf / pdf_prev, active)
+                log.arrive(path, depth, ray, si.t, emitted, nee, active)
 
             # Emitters on the surface are hit even at the last depth; everything below needs one more segment.
             active_next = active & si.is_valid() & (depth + 1 < max_depth)
@@ -163,8 +165,8 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
 
             # ---------------------- Emitter sampling ----------------------
             active_em = active_next & bsdf.smooth
-            ds, weight_em = scene.sample_emitter_direction(si, sampler.next_2d(active_em), True, active_em)
-            active_em &= ds.pdf != 0
+            ds, weight_em = lights.sample(si, sampler.next_2d(active_em), active_em)
+            active_em &= ds.pdf > 0
 
             # ------ Value of the emitter's direction, and the continuation ------
             value, pdf_em, bs, weight = bsdf.eval_pdf_sample(
@@ -191,7 +193,7 @@ class GuidedPathIntegrator(mi.ad.integrators.common.ADIntegrator):
                 log.leave(path, depth, si, bsdf, bs, weight, survive, reflected, active & si.is_valid())
 
             # ---------------------- Update loop variables ----------------------
-            ray = si.spawn_ray(si.to_world(bs.wo))
+            ray = lights.origins.spawn(si, si.to_world(bs.wo))
             beta *= weight
             eta *= bs.eta
             si_prev = dr.detach(mi.Interaction3f(si), True)

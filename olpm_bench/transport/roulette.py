@@ -43,13 +43,21 @@ class PixelEstimate:
 
 
 def by_throughput(beta: mi.Spectrum, eta: mi.Float, deep: mi.Bool) -> mi.Float:
-    """Survival probability after scattering, as in Mitsuba's `path`: `eta` cancels the square that refraction multiplies with."""
-    return dr.select(deep, dr.minimum(dr.max(beta) * dr.square(eta), MOST), 1)
+    """Survival probability after scattering, as in Mitsuba's `path`.
+
+    `eta` cancels the square that refraction multiplies with.  Where a BSDF's `eta` or value is NaN, the path
+    goes on: an end that nothing makes up for would be a bias.
+    """
+    survival = dr.max(beta) * dr.square(eta)
+    return dr.select(deep & (survival < MOST), survival, dr.select(deep, mi.Float(MOST), 1))
 
 
 def by_contribution(beta: mi.Spectrum, outgoing: mi.Float, worth: mi.Float, depth: mi.UInt32) -> mi.Float:
     """Survival probability before scattering: expected contribution over what is `worth` a path; see above.
 
-    Paths without limit must end somewhere, though between white walls they may stay worth their while.
+    Paths without limit must end somewhere, though between white walls they may stay worth their while.  A
+    contribution that is NaN, 0 / 0 or infinity times 0, counts as none.
     """
-    return dr.clip(mi.luminance(beta) * outgoing / worth, LEAST, dr.select(depth < UNBOUNDED_DEPTH, 1, MOST))
+    contribution = mi.luminance(beta) * outgoing / worth
+    most = dr.select(depth < UNBOUNDED_DEPTH, mi.Float(1), MOST)
+    return dr.select(contribution > LEAST, dr.minimum(contribution, most), LEAST)

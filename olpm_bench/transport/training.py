@@ -23,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench.transport.bounds import surface_bounds
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.emission import EmissionGuide, distant_lights
@@ -109,27 +110,6 @@ def check_traceable(scene: mi.Scene) -> None:
     require_valid_box(scene)
 
 
-def surface_bounds(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
-    """Box around all surfaces.
-
-    Mitsuba 3.9.1 gives meshes that its loader merged from rectangles, and with them the scene, an invalid box.
-
-    Raises:
-        InputError: the scene has no surface.
-    """
-    bounds = mi.ScalarBoundingBox3f()
-    for shape in scene.shapes():
-        if shape.bbox().valid():
-            bounds.expand(shape.bbox())
-        elif shape.is_mesh():
-            vertices = shape.vertex_positions_buffer().numpy().reshape(-1, 3).astype(float)
-            bounds.expand(mi.ScalarPoint3f(*vertices.min(0)))
-            bounds.expand(mi.ScalarPoint3f(*vertices.max(0)))
-    if not bounds.valid():
-        raise InputError("the scene has no surface to guide paths from")
-    return bounds
-
-
 class Training:
     """A radiance guide and an importance guide that learn from each other's particles.
 
@@ -186,11 +166,9 @@ class Training:
             yield step(PassStatistics(index, self.passes, warnings=self._out_of_scale() if index == 0 else []))
 
     def _out_of_scale(self) -> list[str]:
-        """What to tell of a scene that is tiny, or far from the origin, for Mitsuba's and our float32."""
-        moved = mi.math.RayEpsilon * (1 + float(np.abs([self.bounds.min, self.bounds.max]).max()))
-        radius = self.radiance.cache.radius
-        return [] if moved < radius else [f"Mitsuba starts rays {moved:.1g} units off surfaces, farther than records reach, "
-                                          f"{radius:.1g}: make the scene larger, or move it to the origin"]
+        """What to tell of a scene that is too far from the origin for single precision."""
+        warning = self.integrator.light_sampling(self.scene).origins.warning()
+        return [warning] if warning else []
 
     @property
     def passes(self) -> int:
@@ -228,7 +206,9 @@ class Training:
         return self._learn_photons(self.settings.photons * self.settings.passes, None, statistics)
 
     def _learn_photons(self, n: int, importance: Guide | None, statistics: PassStatistics) -> PassStatistics:
-        emit = self.emission.emit if self.emission is not None else partial(emit_photons, self.scene)
+        lights = self.integrator.light_sampling(self.scene)
+        unguided = partial(emit_photons, self.scene, lights=lights)
+        emit = self.emission.emit if self.emission is not None else unguided
         photons = self._trace(emit, n, importance, self.radiance, mi.TransportMode.Importance, statistics)
         statistics.kept = self._learn(self.radiance, photons, n, statistics)
         statistics.photons, statistics.stored = n, len(photons)

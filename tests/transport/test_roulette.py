@@ -34,3 +34,14 @@ def test_survival():
     throughput = roulette.by_throughput(beta, mi.Float(1, 2, 100), mi.Bool(True))
     np.testing.assert_allclose(throughput.numpy(), [0.1, 0.4, 0.95], rtol=1e-5)
     assert roulette.by_throughput(beta, mi.Float(1), mi.Bool(False)).numpy() == 1
+
+
+def test_odd_values_end_no_path_for_good():
+    """A survival probability that is NaN would end paths, and nothing would make up for them."""
+    odd = mi.Float(np.float32([np.nan, np.inf, 0]))
+    one = mi.Spectrum(1.0)
+    found = roulette.by_throughput(one, odd, mi.Bool(True)).numpy()
+    np.testing.assert_array_equal(found, np.float32([roulette.MOST, roulette.MOST, 0]))
+    outgoing, worth = mi.Float(np.float32([np.nan, 1, 0, 1])), mi.Float(np.float32([1, np.nan, 0, 0]))
+    found = roulette.by_contribution(one, outgoing, worth, mi.UInt32(1)).numpy()
+    np.testing.assert_array_equal(found, np.float32([roulette.LEAST, roulette.LEAST, roulette.LEAST, 1]))
