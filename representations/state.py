@@ -12,6 +12,8 @@ import numpy as np
 
 State = TypeVar("State")
 
+ALIGNMENT = 64              # [bytes] of the widest vectors that LLVM loads: 16 floats
+
 
 def join(a: Any, b: Any) -> Any:
     """Two arrays one after the other: `dr.concat`, but it takes empty ones and compiles no kernel for each size."""
@@ -23,10 +25,17 @@ def join(a: Any, b: Any) -> Any:
 
 
 def copied(dtype: Any, array: np.ndarray) -> Any:
-    """A NumPy array in Dr.Jit's own memory: NumPy's is aligned now this way, now that, and each way compiles other kernels."""
-    copy = dr.gather(dtype, dtype(array), dr.arange(dr.uint32_array_t(dtype), len(array)))
-    dr.eval(copy)
-    return copy
+    """A copy of a one-dimensional NumPy array, in memory that is always aligned in the same way.
+
+    Dr.Jit's LLVM backend works on NumPy's memory itself, without a copy.  That memory is aligned now this way, now that, and
+    Dr.Jit compiles other kernels for each.
+    """
+    values = np.asarray(array)
+    room = np.empty(values.nbytes + ALIGNMENT, np.uint8)
+    start = -room.ctypes.data % ALIGNMENT
+    own = room[start:start + values.nbytes].view(values.dtype)
+    own[:] = values
+    return dtype(own)
 
 
 def append(state: State, more: State) -> State:
@@ -66,5 +75,5 @@ def from_numpy(like: State, arrays: dict[str, np.ndarray]) -> State:
     Raises:
         KeyError: a field is missing.
     """
-    return dataclasses.replace(like, **{f.name: type(getattr(like, f.name))(arrays[f.name])  # type: ignore[type-var]
+    return dataclasses.replace(like, **{f.name: copied(type(getattr(like, f.name)), arrays[f.name])  # type: ignore[type-var]
                                         for f in dataclasses.fields(like)})  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from asking import states_equal
 
 import representations
 from olpm_bench.check.particles import batch, lobes
-from representations.state import append, bytes_of, copy_records, from_numpy, to_numpy
+from representations.state import append, bytes_of, copied, copy_records, from_numpy, to_numpy
 
 
 @dataclass
@@ -64,3 +64,22 @@ def test_records_are_copied():
     np.testing.assert_array_equal(new.numpy(), [0, 1, 2, 0, 1, 2, 6, 7, 8, 0, 1, 2])
     np.testing.assert_array_equal(array.numpy(), np.arange(12))
     assert len(copy_records(mi.Float(), 4, mi.UInt32([0, 0]), mi.UInt32([1, 3]))) == 0
+
+
+def test_a_copy_has_memory_of_its_own():
+    array = np.arange(5, dtype=np.float32)
+    copy = copied(mi.Float, array)
+    array[:] = -1
+    np.testing.assert_array_equal(copy.numpy(), [0, 1, 2, 3, 4])
+
+
+def test_copies_compile_one_kernel_however_numpy_aligns_its_memory():
+    room = np.arange(200, dtype=np.float32)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for first in range(4):
+            doubled = 2 * copied(mi.Float, room[first:first + 100])
+            dr.eval(doubled)
+            assert doubled[0] == 2 * first
+        kernels = {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+    assert len(kernels) == 1
