@@ -25,6 +25,7 @@ from olpm_bench.transport.headroom import require
 from olpm_bench.transport.mis import power_heuristic
 from olpm_bench.transport.particles import Particles, places
 from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError
+from olpm_bench.transport.usable import usable
 
 MOST_PATHS = 2 ** 18        # kept of a pass
 BYTES = 144                 # of a vertex
@@ -94,6 +95,7 @@ class CameraPaths:
         self.reflected = dr.empty(mi.Float, size)       # by next-event estimation; radiance returned by the continuation
         self.emitted = dr.zeros(mi.Float, size)         # what the continuation hit; how densely next-event estimation finds it
         self.count = dr.zeros(mi.UInt32, self.n_paths)  # vertices kept
+        self.unusable = 0                               # of which `propagate` could not use so many
 
     def arrays(self) -> Iterator[mi.Float]:
         """What the kernel of the path tracer writes."""
@@ -116,7 +118,7 @@ class CameraPaths:
             weight: L / p of the emitter's sample, MIS weight included; found: f cos L / p, without.
         """
         share = wanted(1, found, bsdf.reflected)
-        active = active & self.kept & (depth < self.rows) & (share > 0) & ~ds.delta
+        active = active & self.kept & (depth < self.rows) & (share > 0) & ~ds.delta & usable(weight)
         place = (self.rows + depth) * self.n + self.first + path * self.a_sample
         n = incident_normal(si)
         weight = weight * share * dr.maximum(dr.dot(n, ds.d), 0)
@@ -146,10 +148,14 @@ class CameraPaths:
 
     @dr.syntax
     def propagate(self) -> None:
-        """From the end of each path to its start: the weight of radiance estimates, and the radiance returned."""
+        """From the end of each path to its start: the weight of radiance estimates, and the radiance returned.
+
+        A vertex at which something is NaN, infinite or negative returns nothing and teaches nothing.
+        """
         path = dr.arange(mi.UInt32, self.n_paths)
         left = dr.gather(mi.UInt32, self.count, path)
         radiance = mi.Spectrum(0)                       # R: of the vertex that the walk has come to
+        unusable = mi.UInt32(0)                         # vertices
         while left > 0:
             left -= 1
             place = left * self.n + path
@@ -157,18 +163,25 @@ class CameraPaths:
             reflected = dr.gather(mi.Vector4f, self.reflected, place)
             emitted = dr.gather(mi.Vector4f, self.emitted, place)
             source, factor = mi.Spectrum(emitted.x, emitted.y, emitted.z), mi.Spectrum(weight.x, weight.y, weight.z)
+            by_nee = mi.Spectrum(reflected.x, reflected.y, reflected.z)
             mis = power_heuristic(emitted.w)
             value = mi.luminance(factor * source)
             share = mis * dr.select(reflected.w > 0, wanted(emitted.w, value, reflected.w), 1)
             returned = factor * (source * mis + radiance)
-            dr.scatter(self.position, (mi.luminance(source) * share + mi.luminance(radiance)) * weight.w, 4 * place + 3)
-            dr.scatter(self.reflected, mi.luminance(returned), 4 * place + 3)
-            radiance = mi.Spectrum(reflected.x, reflected.y, reflected.z) + returned
-        dr.eval(self.position, self.reflected)
+            estimate = (mi.luminance(source) * share + mi.luminance(radiance)) * weight.w
+            fine = usable(by_nee) & usable(returned) & usable(estimate)
+            unusable += dr.select(fine, 0, 1)
+            by_nee, returned = dr.select(fine, by_nee, 0), dr.select(fine, returned, 0)
+            dr.scatter(self.position, dr.select(fine, estimate, 0), 4 * place + 3)
+            dr.scatter(self.reflected, mi.Vector4f(by_nee.x, by_nee.y, by_nee.z, mi.luminance(returned)), place)
+            radiance = by_nee + returned
+        dr.eval(self.position, self.reflected, unusable)
+        self.unusable = int(dr.sum(unusable)[0])
 
     def particles(self) -> Particles:
         """All vertices, path by path, as particles that carry the radiance that arrived (`propagate` comes first)."""
-        return Particles(self.position, self.direction, self.normal, places(self.count, self.rows), self.n_paths)
+        return Particles(self.position, self.direction, self.normal, places(self.count, self.rows), self.n_paths,
+                         unusable=self.unusable)
 
     def lessons(self, vertex: mi.UInt32) -> Particles:
         """The vertices at these places with what next-event estimation found at each: all that radiance is learnt from."""

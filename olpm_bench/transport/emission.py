@@ -233,11 +233,7 @@ class EmissionGuide:
     # ---------------------- Emission ----------------------
 
     def emit(self, sampler: mi.Sampler) -> ParticleRays:
-        """Rays that leave the emitters, weight = flux; in place of `emit_photons`.
-
-        Raises:
-            InputError: an emitter gives NaN, infinite or negative radiance.
-        """
+        """Rays that leave the emitters, weight = flux; in place of `emit_photons`."""
         index, choice, sample1 = self.scene.sample_emitter(sampler.next_1d(), True)
         emitter = dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index)
         sample2, sample3 = sampler.next_2d(), sampler.next_2d()

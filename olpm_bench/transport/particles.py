@@ -26,6 +26,7 @@ from olpm_bench.transport.light_sampling import LightSampling
 from olpm_bench.transport.mis import balance_weight
 from olpm_bench.transport.ray_origins import RayOrigins
 from olpm_bench.transport.settings import UNBOUNDED_DEPTH, InputError
+from olpm_bench.transport.usable import usable, usable_ray
 from olpm_bench.transport.window import HEAVIEST, HIGH, LEAST_SURVIVAL, LIGHTEST, LOW, Window
 
 if TYPE_CHECKING:
@@ -41,8 +42,9 @@ DEPARTURES = 8                  # kept of an importon's path on average: its fir
 class ParticleRays:
     """Particles as they leave an emitter or the camera [n]."""
     ray: mi.Ray3f
-    weight: mi.Spectrum     # times 1 / n: the flux or importance of the particle
+    weight: mi.Spectrum     # times 1 / n: the flux or importance of the particle; 0: it is not traced
     unit: mi.Float          # [1] mean luminance of `weight`: the total flux of the emitters
+    unusable: int           # particles that were NaN, infinite or negative, and have weight 0 now
 
 
 @dataclass
@@ -70,6 +72,7 @@ class Particles:
     place: mi.UInt32        # [hits]
     lanes: int
     departures: Departures | None = None
+    unusable: int = 0       # paths that were ended, or vertices that teach nothing, for a NaN, infinite or negative value
 
     def __len__(self) -> int:
         return len(self.place)
@@ -101,9 +104,6 @@ def emit_photons(scene: mi.Scene, sampler: mi.Sampler, lights: LightSampling | N
 
     Args:
         lights: of the scene, for those who have it.
-
-    Raises:
-        InputError: an emitter gives NaN, infinite or negative radiance.
     """
     lights = lights or LightSampling(scene)
     return evaluated(*lights.sample_photon(sampler.next_1d(), sampler.next_2d(), sampler.next_2d()))
@@ -116,19 +116,14 @@ def emit_importons(sensor: mi.Sensor, sampler: mi.Sampler) -> ParticleRays:
 
 
 def evaluated(ray: mi.Ray3f, weight: mi.Spectrum) -> ParticleRays:
-    """Rays and weights, computed.
-
-    Raises:
-        InputError: an emitter gives NaN, infinite or negative radiance.
-    """
-    invalid = dr.count(~dr.all(dr.isfinite(weight) & (weight >= 0)))[0]
-    if invalid:
-        raise InputError(f"{invalid} of {dr.width(weight)} emitted particles have a NaN, infinite or negative weight: "
-                         "check the scene's emitters and their textures")
+    """Rays and weights, computed; those that can't be used have weight 0 and are counted."""
+    found = usable(weight) & usable_ray(ray)
+    weight = mi.Spectrum(dr.select(found, weight, 0))
+    ray = mi.Ray3f(dr.select(found, ray.o, 0), dr.select(found, ray.d, mi.Vector3f(0, 0, 1)))
+    dr.eval(ray, weight, found)
     unit = dr.mean(mi.luminance(weight))
-    rays = ParticleRays(mi.Ray3f(ray), mi.Spectrum(weight), unit)
-    dr.eval(rays)
-    return rays
+    dr.eval(unit)
+    return ParticleRays(ray, weight, unit, int(dr.count(~found)[0]))
 
 
 @dataclass
@@ -213,6 +208,7 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
     met_before = mi.Bool(False)                     # the next vertex is one where a particle has been split
     left = mi.UInt32(0)                             # departures kept so far
     pdf_prev = mi.Float(0)                          # density with which the ray was chosen
+    unusable = mi.UInt32(0)                         # paths that a NaN, infinite or negative value has ended
     active = mi.Bool(True)
 
     while active:
@@ -284,7 +280,9 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
             cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
             same_side = (wi_n * cos_i > 0) & (wo_n * cos_o > 0)
             weight *= dr.select(same_side, dr.abs(cos_i * wo_n / (cos_o * wi_n)), 0)
-        alive = scatter & (dr.max(weight) > 0)
+        broken = scatter & ~(usable(weight) & dr.all(dr.isfinite(d)))
+        unusable[broken] += 1
+        alive = scatter & ~broken & (dr.max(weight) > 0)
         if dr.hint(emission is not None, mode="scalar"):
             pdf_prev = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), dr.largest(mi.Float), bs.pdf)
         ray = origins.spawn(si, d)
@@ -304,10 +302,10 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         met_before = mi.Bool(resume)
         active &= alive | resume | start
 
-    dr.eval(position, direction, normal, count, left_at, left_for, left)
+    dr.eval(position, direction, normal, count, left_at, left_for, left, unusable)
     place = places(count, rows)
     departures = _departures(left_at, left_for, places(left, DEPARTURES * each)) if emission is not None else None
-    return Particles(position, direction, normal, place, lanes, departures)
+    return Particles(position, direction, normal, place, lanes, departures, int(dr.sum(unusable)[0]))
 
 
 def places(count: mi.UInt32, rows: int) -> mi.UInt32:

@@ -33,6 +33,7 @@ from olpm_bench.transport.particles import ParticleRays, Particles, emit_importo
 from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.scene_checks import Fingerprint, require_valid_box
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings
+from olpm_bench.transport.usable import require_usable
 from olpm_bench.transport.view import records_seen
 from olpm_bench.transport.window import by_contribution
 from representations.interface import ParticleBatch
@@ -52,6 +53,7 @@ class PassStatistics:
     spp: int = 0                    # of the image that a camera pass rendered
     stored: int = 0                 # hits of photons, or vertices of camera paths
     kept: int = 0                   # of which taught a record
+    unusable: int = 0               # particles and vertices left out, since a value was NaN, infinite or negative
     records: int = 0                # of the radiance guide
     regions: dict[str, np.ndarray] = field(default_factory=dict)    # where a caller names them: `Particles.by_region`
     seen: float = 0.0               # particles seen so far by the records that camera paths met, on average
@@ -231,6 +233,7 @@ class Training:
                 left = len(particles) / n
                 self.hits[mode] = (wanted, told * wanted / left) if window else (left, left)
         kind = "photons" if mode == mi.TransportMode.Importance else "importons"
+        self._count_unusable(rays.unusable + particles.unusable, n, kind, statistics)
         if rays.unit[0] == 0:
             statistics.warnings.append(f"the {kind} carry nothing: the emitters have no power")
         elif len(particles) == 0:
@@ -238,6 +241,15 @@ class Training:
         if self.regions is not None:
             statistics.regions[kind] = particles.by_region(*self.regions)
         return particles
+
+    def _count_unusable(self, unusable: int, n: int, what: str, statistics: PassStatistics) -> None:
+        """
+        Raises:
+            InputError: most of n are unusable.
+        """
+        statistics.unusable += unusable
+        if warning := require_usable(unusable, n, what):
+            statistics.warnings.append(warning)
 
     def _learn(self, guide: Guide, particles: Particles, emitted: int, statistics: PassStatistics) -> int:
         if len(particles) == 0:             # nothing of this pass has reached a second surface
@@ -281,6 +293,7 @@ class Training:
             paths.propagate()
         vertices, guide = paths.particles(), self.radiance
         if len(vertices):
+            self._count_unusable(vertices.unusable, len(vertices), "vertices of camera paths", statistics)
             with _Seconds(statistics, "grow"):
                 p, _, _, _, n = vertices.read(vertices.place)
                 self._grow(guide, p, n, dr.squared_norm(n) > 0, statistics)         # not where all is specular

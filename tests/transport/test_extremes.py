@@ -101,7 +101,7 @@ def test_lamps_without_power_are_black_and_said_to_be():
 
 
 def test_lamps_too_strong_for_float32_are_refused():
-    with pytest.raises(InputError, match="weight: check the scene's emitters"):
+    with pytest.raises(InputError, match="photons are NaN, infinite or negative"):
         train(scaled(1, radiance=3e38))
 
 
