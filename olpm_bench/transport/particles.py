@@ -117,7 +117,8 @@ def emit_importons(sensor: mi.Sensor, sampler: mi.Sampler) -> ParticleRays:
 
 def evaluated(ray: mi.Ray3f, weight: mi.Spectrum) -> ParticleRays:
     """Rays and weights, computed; those that can't be used have weight 0 and are counted."""
-    found = usable(weight) & usable_ray(ray)
+    summable = usable(weight * dr.width(weight))
+    found = summable & (usable_ray(ray) | (dr.max(weight) == 0))        # black lights may send rays nowhere
     weight = mi.Spectrum(dr.select(found, weight, 0))
     ray = mi.Ray3f(dr.select(found, ray.o, 0), dr.select(found, ray.d, mi.Vector3f(0, 0, 1)))
     dr.eval(ray, weight, found)
