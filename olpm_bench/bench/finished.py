@@ -55,8 +55,7 @@ class FinishedScene:
     def _errors(self, images: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         if self.reference is None:
             return {name: np.full(len(images), np.nan) for name in metrics.METRICS}
-        truth = self.reference.mean
-        return {name: np.array([metric(image, truth) for image in images]) for name, metric in metrics.METRICS.items()}
+        return metrics.errors(images, self.reference.mean)[0]
 
     def curves(self, over: str = "seconds") -> dict[str, statistics.Curve]:
         """Method -> its L1 error over a column of the traces: charged seconds, or "spp".  There must be a reference.

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from olpm_bench.bench import flip as hdr_flip
 from olpm_bench.report import tonemap
 
 EPSILON = 0.01          # of the relative metrics, in units of radiance
@@ -73,14 +74,9 @@ def relmse_trimmed(x: np.ndarray, r: np.ndarray) -> float:
 
 
 def flip(x: np.ndarray, r: np.ndarray) -> float:
-    """Mean HDR-FLIP [Andersson et al. 2021], whose range of exposures comes from the reference alone."""
-    import flip_evaluator
-
+    """Mean HDR-FLIP at the exposures that the reference fixes; NaN for a black one: see `olpm_bench.bench.flip`."""
     _pair(x, r)
-    if not (np.isfinite(x).all() and np.isfinite(r).all()):
-        return float("nan")
-    test, reference = (np.maximum(image, 0).astype(np.float32) for image in (x, r))
-    return float(flip_evaluator.evaluate(reference, test, "HDR", applyMagma=False)[1])
+    return hdr_flip.flip(x, r)
 
 
 def ssim_error(x: np.ndarray, r: np.ndarray) -> float:
@@ -120,6 +116,25 @@ def relative_variance(Y: np.ndarray) -> float:
 # The registries: a new metric is a function and its name here; summaries, comparisons and claims know it by that.
 METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     f.__name__: f for f in (l1, mape, smape, relmse, relmse_trimmed, flip, ssim_error)}
+
+
+def errors(images: Sequence[np.ndarray], reference: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Every metric of every image (h, w, 3).
+
+    Returns:
+        Metric -> errors (images), NaN where the metric is undefined or fails; and a sentence on each metric that fails.
+    """
+    found: dict[str, np.ndarray] = {}
+    failures = []
+    for name, metric in METRICS.items():
+        try:
+            found[name] = np.array([metric(image, reference) for image in images], np.float64)
+        except (Exception, SystemExit) as error:        # whatever is wrong with a metric, the others have their values
+            found[name] = np.full(len(images), np.nan)
+            failures.append(f"{name} has no value: {error or type(error).__name__}")
+    return found, failures
+
+
 # Of the luminances of all seeds (seeds, h, w) and their charged seconds (seeds); they need no reference.
 OVER_SEEDS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     "relative_variance": lambda Y, seconds: relative_variance(Y),
