@@ -47,7 +47,7 @@ def compare(a: Path, b: Path, reference: Path | None = None) -> Comparison:
     """The errors of two images, or without a reference that of `a` with `b` as the reference.
 
     Args:
-        a, b: EXR files of one size: ours (the part "mean") or of any other renderer (the first part).
+        a, b: EXR files of one size: ours (the layer "mean") or of any other renderer (what it shows).
         reference: an EXR, or a folder that `olpm-bench reference` has made; it may be larger by a whole factor.
 
     Raises:
