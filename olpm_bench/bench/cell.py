@@ -322,7 +322,7 @@ def measure(spec: CellSpec, scene: mi.Scene, warm: WarmUp, guide: Guide | None =
         "records": guide.records if guide is not None else 0, "particles": guide.particles if guide is not None else 0,
         "bytes_per_record": guide.bytes_per_record if guide is not None else 0,
         "mean": float(cell.brightness.mean[0, 0, 0]), "mean_stderr": math.sqrt(float(cell.brightness.variance()[0, 0, 0])),
-        "pass_spp": spp, "passes": cell.training,
+        "pass_spp": spp, "image_passes": image.passes, "passes": cell.training,
     }
     h, w, _ = image.mean.shape
     layers = {"mean": image.mean, "variance": image.variance(), "count": np.full((h, w), image.spp, np.float32)}

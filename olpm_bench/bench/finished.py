@@ -4,18 +4,18 @@ Reads results, renders nothing: a new metric needs no new cell.
 """
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from olpm_bench.bench import metrics, statistics
+from olpm_bench.bench import bias, gains, metrics, pixel_variance, statistics
 from olpm_bench.bench.files import read_json
 from olpm_bench.bench.reference_file import NEAR_FLOOR, Reference
 from olpm_bench.bench.results import Cell, Results
-from olpm_bench.bench.summary import complete_cells, work
+from olpm_bench.bench.summary import complete_cells
 
 if TYPE_CHECKING:
     from olpm_bench.bench.config import Experiment, Scene
@@ -25,11 +25,16 @@ class Final(NamedTuple):
     """What the final images of a method show.
 
     errors: by metric, one per seed; NaN without reference.
-    gain: the baseline's work-normalised variance over the method's.
+    variances: by `gains.KINDS`, the work-normalised variance [s].
+    gains: by `gains.KINDS`, the baseline's work-normalised variance over the method's.
+    passes: of all cells, which variances stand on.
+    means: of the images, for the bias guard.
     """
     errors: dict[str, np.ndarray]
-    work_normalised_variance: float
-    gain: statistics.Interval
+    variances: dict[str, statistics.Interval]
+    gains: dict[str, statistics.Interval]
+    passes: int
+    means: bias.Means
 
 
 @dataclass(frozen=True)
@@ -47,12 +52,22 @@ class FinishedScene:
     @cached_property
     def final(self) -> dict[str, Final]:
         """Method -> what its final images show."""
-        images = {method: [cell.image()["mean"] for cell in cells] for method, cells in self.cells.items()}
-        works = {method: work(self.cells[method], means) for method, means in images.items()}
-        return {method: Final(self._errors(means), metrics.work_normalised_variance(means, float(works[method].seconds.mean())),
-                              statistics.gain(works[self.baseline], works[method])) for method, means in images.items()}
+        errors, variances, guards, radiances = {}, {}, {}, []
+        for method, cells in self.cells.items():        # one at a time: images take memory
+            images = pixel_variance.read(cells)
+            errors[method] = self._errors(images.mean)
+            variances[method] = gains.work_variance(method, images)
+            guards[method] = bias.means(cells, images)
+            radiances.append(images.mean.mean(axis=0))
+        radiance = self.reference.mean if self.reference is not None else np.mean(radiances, axis=0)
+        normalised = {method: gains.normalised(variance, radiance) for method, variance in variances.items()}
+        baseline = normalised[self.baseline]
+        return {method: Final(errors[method], {kind: gains.estimate(variance, kind) for kind in gains.KINDS},
+                              {kind: gains.gain(baseline, variance, kind) for kind in gains.KINDS}, variance.passes,
+                              guards[method])
+                for method, variance in normalised.items()}
 
-    def _errors(self, images: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    def _errors(self, images: np.ndarray) -> dict[str, np.ndarray]:
         if self.reference is None:
             return {name: np.full(len(images), np.nan) for name in metrics.METRICS}
         return metrics.errors(images, self.reference.mean)[0]

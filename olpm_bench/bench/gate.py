@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from olpm_bench.bench import metrics, statistics
+from olpm_bench.bench.bias import APART
 from olpm_bench.bench.config import Claim, ConfigError, Experiment
 from olpm_bench.bench.files import SCHEMA_VERSION
 from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Cell, Results
-from olpm_bench.bench.summary import APART, apart, complete_cells, number, print_whole, work
+from olpm_bench.bench.summary import apart, complete_cells, number, print_whole, work
 from olpm_bench.bench.terminal import plain_console
 
 if TYPE_CHECKING:

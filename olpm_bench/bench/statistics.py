@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from olpm_bench.bench import metrics
 from olpm_bench.transport.settings import InputError
 
 BAND = (5.0, 95.0)          # [%]
@@ -31,6 +30,7 @@ class Interval(NamedTuple):
     low: float
     high: float
     bound: str = ""         # ">": at least the value; "<": at most
+    why: str = ""           # there is no value, in words
 
     def ends(self, dash: str = "-") -> str:
         """The interval in brackets, after a space; empty where there is none."""
@@ -180,7 +180,7 @@ def speed_up(baseline: Curve, method: Curve, error: float | None = None, least: 
     Returns:
         NaN where one of them does not reach the error, or both start below it.  Where only one starts below, the ratio with its
         first time bounds the speed-up, and `bound` says from which side.  No interval where a seed less makes that so, nor with
-        two seeds, as for gains.
+        two seeds.
     """
     _paired(baseline, method)
     n = len(method.errors)
@@ -213,22 +213,6 @@ def worst_speed_up(baseline: Curve, method: Curve, least: float = 0.0) -> float:
     ratios = [time_to_error(baseline.times, a, error) / time_to_error(method.times, b, error) for error in (*a, *b)
               if error >= least]
     return min((ratio for ratio in ratios if np.isfinite(ratio)), default=float("nan"))
-
-
-def gain(baseline: Work, method: Work) -> Interval:
-    """Work-normalised variance of the baseline over that of the method, with a paired jackknife interval.
-
-    Returns:
-        NaN with one seed or black images; no interval with two seeds, which leave no variance.  Of simulated gains the intervals
-        cover 87 to 93 % with 3, 6 and 8 seeds, those of a bootstrap 57 to 84 %.
-    """
-    if len(baseline.seconds) != len(method.seconds):
-        raise ValueError(f"{len(baseline.seconds)} and {len(method.seconds)} seeds: methods are compared in pairs of seeds")
-
-    def ratio(index: np.ndarray) -> float:
-        a, b = (metrics.relative_variance(work.luminance[index]) * work.seconds[index].mean() for work in (baseline, method))
-        return float(a / b) if b > 0 else float("nan")
-    return jackknife(ratio, len(method.seconds))
 
 
 def _paired(a: Curve, b: Curve) -> None:

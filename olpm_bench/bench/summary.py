@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import metrics, statistics
+from olpm_bench.bench import bias, gains, metrics, pixel_variance, statistics
+from olpm_bench.bench.bias import APART
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
 from olpm_bench.bench.reference_file import NEAR_FLOOR
 from olpm_bench.bench.results import Cell, Results, warnings
 from olpm_bench.bench.terminal import plain_console
 
-APART = 6.0                 # standard errors between the mean images of two methods, beyond which that is said
 LATE = 0.05                 # share of a budget in seconds by which a cell may exceed it, before that is said
 SLOWER = 0.95               # `worst_speed_up` below which that is said
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from olpm_bench.bench.config import Experiment
-    from olpm_bench.bench.finished import Finished, FinishedScene
+    from olpm_bench.bench.finished import Final, Finished, FinishedScene
 
 
 def complete_cells(experiment: Experiment, results: Results, any_version: bool = False) -> dict[tuple[str, str], list[Cell]]:
@@ -65,14 +65,17 @@ def _agrees(stored: Any, now: Any) -> bool:
 def summarise(finished: Finished) -> dict[str, Any]:
     """The summary of an experiment: ``{"schema_version", "rows"}``, one row a scene and method, in the TOML's order.
 
-    Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 % quantiles,
-    `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, and `overrun` is the
-    largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.  `gain` is the
-    baseline's work-normalised variance over the method's, with its 90 % jackknife interval, `speed_up` how many times as fast
-    it is to equal L1 (at least, or at most, by `speed_up_bound` ">" or "<"), `worst_speed_up` by `statistics.worst_speed_up`,
-    `apart` by `apart` from the baseline, `memory` by `Cell.memory` [bytes], and `guided` the share of the surfaces that the
-    camera sees whose records have learnt enough to guide; `warnings` are those of training.  What has no value (a spread of one
-    seed, the error of a scene without reference, what a guide has without one) is None.
+    Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 %
+    quantiles, `mean` is the mean with its standard error, `compile_seconds` and `wait_fraction` are the largest, and
+    `overrun` is the largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.
+    `work_normalised_variance` [s] and `gain` are those of :mod:`olpm_bench.bench.gains` by the median, with `_trimmed` and
+    `_mean` by the means over pixels, each with its 90 % interval; `variance_passes` are the passes of all cells that they
+    stand on, and `undefined` says which of them there are not and why.  `speed_up` is how many times as fast it is to
+    equal L1 (at least, or at most, by `speed_up_bound` ">" or "<"), `worst_speed_up` by `statistics.worst_speed_up`.
+    `apart`, `bias_seen` and `block_bias_seen` are the `bias.Difference` from the baseline, `memory` is by `Cell.memory`
+    [bytes], and `guided` the share of the surfaces that the camera sees whose records have learnt enough to guide;
+    `warnings` are those of training.  What has no value (a spread of one seed, the error of a scene without reference,
+    what a guide has without one) is None.
     """
     budget = finished.experiment.budget.seconds
     rows = [_row(scene, method, budget) for scene in finished.scenes for method in scene.cells]
@@ -86,32 +89,26 @@ def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work
 
 
 def apart(a: Sequence[Cell], b: Sequence[Cell]) -> float:
-    """By how many standard errors the mean images of two methods differ; of the errors by pixels and over seeds, the larger.
-
-    Of images of so few samples that they don't know their error, that of pixels is infinite.
-    """
-    def mean(cells: Sequence[Cell]) -> tuple[float, float]:
-        means, errors = (np.array([cell.info[key] for cell in cells], np.float64) for key in ("mean", "mean_stderr"))
-        by_pixels = np.sqrt(np.mean(np.where(np.isnan(errors), np.inf, errors) ** 2))
-        over_seeds = np.std(means, ddof=1) if len(cells) > 1 else 0.0
-        return float(means.mean()), float(max(by_pixels, over_seeds) / np.sqrt(len(cells)))
-    (x, x_error), (y, y_error) = mean(a), mean(b)
-    return abs(x - y) / max(np.hypot(x_error, y_error), np.finfo(float).tiny)
+    """By how many standard errors the mean images of two methods differ, as `bias.Difference` says; `APART` is too many."""
+    return bias.difference(*(bias.means(cells, pixel_variance.read(cells)) for cells in (a, b))).apart
 
 
 def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, Any]:
     cells, final = scene.cells[method], scene.final[method]
+    differs = bias.difference(final.means, scene.final[scene.baseline].means)
+    if method == scene.baseline:        # from itself
+        differs = bias.Difference(0.0, np.nan, np.nan)
     info = {key: np.array([cell.info[key] for cell in cells], np.float64) for key in (      # null becomes NaN
         "training_passes", "train_seconds", "render_seconds", "compile_seconds", "wait_fraction", "spp", "records",
         "bytes_per_record", "particles", "mean", "mean_stderr", "charged_seconds")}
-    l1, gain = statistics.median_band(final.errors["l1"]), final.gain
+    l1 = statistics.median_band(final.errors["l1"])
     faster = scene.speed_ups.get(method, statistics.Interval(np.nan, np.nan, np.nan))
     return plain({
         "scene": scene.scene.name, "method": method, "seeds": [cell.seed for cell in cells],
         "l1": l1.median, "l1_low": l1.low, "l1_high": l1.high,
         **{name: np.median(values) for name, values in final.errors.items()},
-        "work_normalised_variance": final.work_normalised_variance,
-        "gain": gain.value, "gain_low": gain.low, "gain_high": gain.high,
+        **_by_kind("work_normalised_variance", final.variances), **_by_kind("gain", final.gains),
+        "variance_passes": final.passes, "undefined": undefined(final),
         "speed_up": faster.value, "speed_up_low": faster.low, "speed_up_high": faster.high, "speed_up_bound": faster.bound,
         "mean": np.mean(info["mean"]),
         "mean_stderr": np.sqrt(np.sum(info["mean_stderr"] ** 2)) / len(cells),      # seeds are independent
@@ -125,10 +122,29 @@ def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, A
         "particles": _whole(np.median(info["particles"])),
         "memory": _median([cell.memory() for cell in cells]), "guided": _median([cell.info.get("trained") for cell in cells]),
         "worst_speed_up": scene.worst_speed_ups.get(method),
-        "apart": apart(cells, scene.cells[scene.baseline]),
+        **differs._asdict(),
         "noise_floor": scene.reference.noise_floor if scene.reference is not None else None,
         "warnings": warnings([cell.info for cell in cells]),
     })
+
+
+def _by_kind(name: str, found: Mapping[str, statistics.Interval]) -> dict[str, float]:
+    """Columns for each of `gains.KINDS`: the value and the ends of its interval; the median has the bare name."""
+    columns: dict[str, float] = {}
+    for kind, interval in found.items():
+        column = name if kind == "median" else f"{name}_{kind}"
+        columns |= {column: interval.value, f"{column}_low": interval.low, f"{column}_high": interval.high}
+    return columns
+
+
+def undefined(final: Final) -> list[str]:
+    """Which of a method's variances and gains there are not, and why, a sentence for each reason."""
+    reasons: dict[str, list[str]] = {}
+    for noun, found in (("variance", final.variances), ("gain", final.gains)):
+        for reason in dict.fromkeys(interval.why for interval in found.values() if interval.why):
+            kinds = [kind for kind, interval in found.items() if interval.why == reason]
+            reasons.setdefault(reason, []).append(noun if kinds == list(found) else f"{noun} by {' or '.join(kinds)}")
+    return [f"there is no {' and no '.join(nouns)}, since {reason}" for reason, nouns in reasons.items()]
 
 
 def _whole(value: np.floating) -> int:
@@ -142,13 +158,14 @@ def _median(values: Sequence[float | None]) -> float | None:
 
 
 def write(summary: dict[str, Any], results: Results) -> None:
-    """Write summary.json and table.csv (seeds separated by spaces, warnings by semicolons, empty for no value) into the results
+    """Write summary.json and table.csv (seeds separated by spaces, sentences by semicolons, empty for no value) into the results
     folder."""
     results.write_json("summary.json", summary)
     text = io.StringIO()
     table = csv.DictWriter(text, list(summary["rows"][0]), lineterminator="\n")
     table.writeheader()
-    table.writerows({**row, "seeds": " ".join(map(str, row["seeds"])), "warnings": "; ".join(row["warnings"])}
+    table.writerows({**row, "seeds": " ".join(map(str, row["seeds"])),
+                     **{key: "; ".join(row[key]) for key in ("undefined", "warnings")}}
                     for row in summary["rows"])
     results.write_text("table.csv", text.getvalue())
 
@@ -160,7 +177,7 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
 
     table = Table(box=None, padding=(0, 1), collapse_padding=True, header_style="bold", pad_edge=False)
     scenes = list(dict.fromkeys(row["scene"] for row in summary["rows"]))
-    for name in ("method", "L1", "5-95 %", "relMSE", "trimmed", "var x s", "gain", "passes", "train s", "render s", "spp",
+    for name in ("method", "L1", "5-95 %", "relMSE", "trimmed", "gain", "trimmed gain", "passes", "train s", "render s", "spp",
                  "records"):
         table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
     for scene in scenes:
@@ -172,12 +189,35 @@ def print_table(summary: dict[str, Any], console: Console | None = None) -> None
             table.add_row(
                 Text("  " + row["method"]),
                 Text(number(row["l1"]), style="bold green" if row["l1"] is not None and row["l1"] == best else ""), spread,
-                number(row["relmse"]), number(row["relmse_trimmed"]), number(row["work_normalised_variance"]),
-                _gain(row), f"{row['training_passes']}",
+                number(row["relmse"]), number(row["relmse_trimmed"]),
+                with_ends(row, "gain"), with_ends(row, "gain_trimmed"), f"{row['training_passes']}",
                 f"{row['train_seconds']:.1f}", f"{row['render_seconds']:.1f}", f"{row['spp']}", f"{row['records']}")
     console = console or plain_console()
     print_whole(table, console)
+    print_variances(summary, console)
     _print_notes(summary, console)
+
+
+def print_variances(summary: dict[str, Any], console: Console) -> None:
+    """Print what is known of the variances and gains of each row, and on how many seeds and passes it stands."""
+    from rich.table import Table
+    from rich.text import Text
+
+    title = "Relative variance of a pixel x seconds, and gain over the baseline, with 90 % intervals"
+    table = Table(box=None, padding=(0, 1), collapse_padding=True, header_style="bold", pad_edge=False)
+    for name in ("method", "seeds", "passes", *(f"{what}, {kind}" for kind in gains.KINDS for what in ("var x s", "gain"))):
+        table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
+    scene = None
+    for row in summary["rows"]:
+        if row["scene"] != scene:
+            scene = row["scene"]
+            table.add_row(Text(scene, style="bold"), *[""] * 8)
+        columns = [f"{name}{suffix}" for suffix in ("", "_trimmed", "_mean") for name in ("work_normalised_variance", "gain")]
+        table.add_row(Text("  " + row["method"]), f"{len(row['seeds'])}", f"{row['variance_passes']}",
+                      *(with_ends(row, column) for column in columns))
+    console.print()
+    console.print(title, style="bold", markup=False, highlight=False, soft_wrap=True)
+    print_whole(table, console)
 
 
 def print_metrics(summary: dict[str, Any], console: Console | None = None) -> None:
@@ -198,9 +238,10 @@ def print_metrics(summary: dict[str, Any], console: Console | None = None) -> No
 def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """What is to be known of the cells of a table's rows: that they waited, took long, had to warn, were overtaken, or
     differ in the mean."""
-    found = []
+    shared = set.intersection(*(set(row["undefined"]) for row in rows)) if len(rows) > 1 else set()
+    found = [sentence for sentence in rows[0]["undefined"] if sentence in shared]       # of all rows: told once
     for row in rows:
-        said = list(row["warnings"])
+        said = [sentence for sentence in row["undefined"] if sentence not in shared] + list(row["warnings"])
         if row["wait_fraction"] > WAITED:
             said.append(f"waited {row['wait_fraction']:.0%} of its time for a busy core")
         if row["overrun"] is not None and row["overrun"] > LATE:
@@ -210,13 +251,31 @@ def notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         if row["worst_speed_up"] is not None and row["worst_speed_up"] < SLOWER:
             said.append(f"{row['worst_speed_up']:.2g}x as fast as the baseline to the L1 error where it compares worst")
         if row["apart"] > APART:
-            said.append(f"its mean image is {row['apart']:.0f} standard errors from the baseline's: one of the two is biased, or "
-                        "has too few samples to know its error")
+            said.append(f"its mean image is {row['apart']:.0f} standard errors from the baseline's, in the whole or in a "
+                        "block: one of the two is biased, or has too few samples to know its error")
         found += [f"{row['scene']} / {row['method']}: {words}" for words in said]
     return found
 
 
+def bias_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How large a bias would have been seen between the mean images of each method and the baseline, in words."""
+    lines = []
+    for row in rows:
+        if row["bias_seen"] is None or row["apart"] > APART:        # of the baseline, or unknown; or told by `notes`
+            continue
+        block = "" if row["block_bias_seen"] is None else f", or of {_share_of(row['block_bias_seen'])} a block's,"
+        lines.append(f"{row['scene']} / {row['method']}: its mean image agrees with the baseline's; a bias of "
+                     f"{_share_of(row['bias_seen'])} the image's mean{block} would have been seen")
+    return lines
+
+
+def _share_of(value: float) -> str:
+    return f"{100 * value:.2g} % of" if value < 1 else f"{value:.2g} times"
+
+
 def _print_notes(summary: dict[str, Any], console: Console) -> None:
+    for line in bias_lines(summary["rows"]):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     for note in notes(summary["rows"]):
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
@@ -229,9 +288,12 @@ def print_whole(table: Table, console: Console) -> None:
     console.width = terminal
 
 
-def _gain(row: Mapping[str, Any]) -> str:
-    spread = f" ({number(row['gain_low'])}-{number(row['gain_high'])})" if row["gain_low"] is not None else ""
-    return number(row["gain"]) + spread
+def with_ends(row: Mapping[str, Any], column: str, dash: str = "-") -> str:
+    """A number of a row and its interval; a dash where there is none, as no number stands without its interval."""
+    ends = [row[column + end] for end in ("_low", "_high")]
+    if None in ends:
+        return "-"
+    return f"{number(row[column])} ({number(ends[0])}{dash}{number(ends[1])})"
 
 
 def print_speed_ups(found: Mapping[str, Mapping[str, statistics.Interval]], baseline: str,
@@ -257,6 +319,8 @@ def speed_up_lines(found: Mapping[str, Mapping[str, statistics.Interval]], basel
 def _ratio(interval: statistics.Interval, baseline: str) -> str:
     if not math.isfinite(interval.value):
         return f"shares no L1 error with {baseline}"
+    if not interval.bound and not interval.ends():
+        return f"its speed-up over {baseline} has no interval, which takes 3 seeds that all reach the L1 error"
     bound = {">": "more than ", "<": "less than ", "": ""}[interval.bound]
     return f"{bound}{interval.value:.2g}x{interval.ends()} as fast as {baseline} at equal L1"
 

@@ -75,7 +75,7 @@ def page(found: Finished, rows: Sequence[Mapping[str, Any]], blocks: Sequence[sh
         experiment=experiment, budget=sheet.budget(experiment), commands=made_by, command=made_by[-1],
         machines="; ".join(found.machines),
         viewers=viewers(found, blocks), headers=HEADERS, rows=table(rows), notes=summary.notes(rows),
-        speed_ups=summary.speed_up_lines(found.speed_ups, experiment.baseline_name),
+        speed_ups=summary.speed_up_lines(found.speed_ups, experiment.baseline_name) + summary.bias_lines(rows),
         figures=[{"name": name, "svg": svg(results.folder / f"{name}.svg", CAPTIONS[name]), "caption": CAPTIONS[name]}
                  for name in figures],
         configuration=experiment.toml(results.folder), machine=machine(read_json(results.folder / "env.json")),
@@ -163,8 +163,10 @@ def rgbe(image: np.ndarray) -> np.ndarray:
 
 # ---------------------------------------------------------------- numbers
 
-HEADERS = ("scene", "method", "L1", "relMSE", "trimmed", "var\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}s",
-           "gain", "training [s]", "rendering [s]", "spp", "records", "bytes a record", "mean", "waited")
+VARIANCE = "var\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}s"
+HEADERS = ("scene", "method", "L1", "relMSE", "trimmed", VARIANCE, "gain", f"trimmed {VARIANCE}", "trimmed gain",
+           f"mean {VARIANCE}", "mean gain", "seeds, passes", "training [s]", "rendering [s]", "spp", "records",
+           "bytes a record", "mean", "waited")
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> list[list[Number]]:
@@ -185,7 +187,9 @@ def _numbers(row: Mapping[str, Any], lowest: float | None) -> list[Number]:
     return [
         Number(row["scene"], row["scene"]), Number(row["method"], row["method"]),
         l1._replace(best=l1.value is not None and l1.value == lowest), number("relmse"), number("relmse_trimmed"),
-        number("work_normalised_variance"), number("gain", spread("gain_low", "gain_high")),
+        *(Number(summary.with_ends(row, column + kind, "\N{EN DASH}"), row[column + kind])
+          for kind in ("", "_trimmed", "_mean") for column in ("work_normalised_variance", "gain")),
+        Number(f"{len(row['seeds'])}, {row['variance_passes']:,}", row["variance_passes"]),
         Number(f"{row['train_seconds']:.1f} ({row['training_passes']})", row["train_seconds"]),
         Number(f"{row['render_seconds']:.1f}", row["render_seconds"]),
         *(Number(f"{row[key]:,}", row[key]) for key in ("spp", "records", "bytes_per_record")),

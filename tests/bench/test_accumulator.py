@@ -38,3 +38,16 @@ def test_an_accumulator_goes_on_where_it_was():
         resumed.add(x, 2)
     np.testing.assert_allclose(resumed.mean, whole.mean)
     np.testing.assert_allclose(resumed.variance(), whole.variance())
+
+
+def test_noisier_passes_of_another_size_count_by_their_own_noise():
+    """Four passes of 8 samples with variance 4 each, as of a guide that still learns, then sixteen of 2 with variance 1.
+
+    The variance of the mean is (32 x 4 + 32 x 1) / 64^2.  That of equal samples would be 40 % too small.
+    """
+    rng, trials = np.random.default_rng(4), 20_000
+    accumulator = Accumulator.empty(1, trials)
+    for size, variance in [(8, 4.0)] * 4 + [(2, 1.0)] * 16:
+        accumulator.add(rng.normal(1, np.sqrt(variance / size), (1, trials, 3)), size)
+    truth = (32 * 4.0 + 32 * 1.0) / 64**2
+    assert 0.92 * truth < accumulator.variance().mean() < 1.02 * truth

@@ -134,56 +134,6 @@ def test_pairing_removes_what_the_seeds_share():
     assert 3.88 < interval.low <= interval.value <= interval.high < 4.12
 
 
-def work(rng: np.random.Generator, sigma: float, seconds: float, seeds: int, shared: np.ndarray | float = 0) -> statistics.Work:
-    return statistics.Work(1 + rng.normal(0, sigma, (seeds, 30, 40)) + shared, seconds * rng.uniform(0.99, 1.01, seeds))
-
-
-def test_the_gain_is_the_ratio_of_variance_times_seconds():
-    rng = np.random.default_rng(5)
-    slow, fast = work(rng, 0.2, 6, 8), work(rng, 0.1, 8, 8)
-    gain = statistics.gain(slow, fast)
-    a, b = (np.median(w.luminance.var(0, ddof=1) / (w.luminance.mean(0) ** 2 + 1e-3)) * w.seconds.mean() for w in (slow, fast))
-    assert gain.value == pytest.approx(a / b, rel=1e-3) and gain.value == pytest.approx(3, rel=0.1)
-    assert gain.low < gain.value < gain.high < 1.3 * gain.low
-    assert statistics.gain(slow, slow) == (1, 1, 1, "")
-    cheap = fast._replace(seconds=fast.seconds / 2)
-    assert statistics.gain(slow, cheap).value == pytest.approx(2 * gain.value)
-    with pytest.raises(ValueError, match="8 and 7 seeds"):
-        statistics.gain(slow, statistics.Work(fast.luminance[1:], fast.seconds[1:]))
-
-
-@pytest.mark.parametrize("n", [3, 8])
-def test_intervals_of_gains_cover_it(n):
-    """Skewed pixels, and guides that differ from seed to seed: of 90 % intervals at least 85 % and not all hold the truth, 4."""
-    rng, held, runs = np.random.default_rng(4), 0, 200
-    for _ in range(runs):
-        noise = np.exp(0.2 * rng.standard_normal((2, n, 1, 1))) * (rng.gamma(1, size=(2, n, 12, 12)) - 1)
-        slow, fast = (statistics.Work(1 + scale * x, np.ones(n)) for scale, x in zip((0.2, 0.1), noise, strict=True))
-        interval = statistics.gain(slow, fast)
-        held += interval.low <= 4 <= interval.high
-    assert 0.85 * runs <= held < runs
-
-
-def test_gains_are_paired():
-    """Noise that the seeds of both methods share leaves the interval narrow: it goes for both at once."""
-    rng = np.random.default_rng(6)
-    shared = rng.normal(0, 1, (6, 1, 1)) * rng.uniform(0.1, 0.5, (30, 40))
-    a, b = work(rng, 1e-3, 1, 6, shared), work(rng, 1e-3, 1, 6, shared)
-    paired, apart = statistics.gain(a, b), statistics.gain(a, statistics.Work(b.luminance[[3, 0, 5, 1, 2, 4]], b.seconds))
-    assert paired.high / paired.low < 1.05 < apart.high / apart.low
-
-
-def test_gains_of_few_seeds_or_black_images():
-    rng = np.random.default_rng(7)
-    one, two = work(rng, 0.1, 1, 1), work(rng, 0.1, 1, 2)
-    assert np.isnan(statistics.gain(one, one)[:3]).all()
-    gain = statistics.gain(two, work(rng, 0.1, 1, 2))
-    assert gain.value > 0 and np.isnan([gain.low, gain.high]).all()         # without one of two there is no variance
-    assert np.isfinite(statistics.gain(work(rng, 0.1, 1, 3), work(rng, 0.1, 1, 3))[:3]).all()
-    black = statistics.Work(np.zeros((3, 4, 5)), np.ones(3))
-    assert np.isnan(statistics.gain(black, black).value)
-
-
 def test_bootstrap_repeats_and_needs_two_seeds():
     data = np.random.default_rng(3).normal(size=9)
     intervals = [statistics.bootstrap(lambda index: data[index].mean(), 9) for _ in range(2)]

@@ -19,10 +19,11 @@ from olpm_bench.bench.results import Results
 from olpm_bench.transport.settings import IntegratorSettings
 
 KEYS = ["scene", "method", "seeds", "l1", "l1_low", "l1_high", "mape", "smape", "relmse", "relmse_trimmed", "flip", "ssim_error",
-        "work_normalised_variance", "gain", "gain_low", "gain_high", "speed_up", "speed_up_low", "speed_up_high",
+        *(f"{name}{kind}{end}" for name in ("work_normalised_variance", "gain") for kind in ("", "_trimmed", "_mean")
+          for end in ("", "_low", "_high")), "variance_passes", "undefined", "speed_up", "speed_up_low", "speed_up_high",
         "speed_up_bound", "mean", "mean_stderr", "charged_seconds", "overrun", "training_passes", "train_seconds",
         "render_seconds", "compile_seconds", "wait_fraction", "spp", "records", "bytes_per_record", "particles", "memory",
-        "guided", "worst_speed_up", "apart", "noise_floor", "warnings"]
+        "guided", "worst_speed_up", "apart", "bias_seen", "block_bias_seen", "noise_floor", "warnings"]
 ERRORS = {"Slow": [0.4, 0.5, 0.9], "Fast": [0.2, 0.25, 0.45]}       # of seeds 4, 5, 7 after 16 s; falling as 1/sqrt(t)
 TIMES = [1.0, 4.0, 16.0]
 
@@ -40,11 +41,12 @@ def folder(tmp_path, errors: dict[str, list[float]], seeds: list[int]) -> Simple
         images = [truth + np.float32(error * np.sqrt(16 / t)) for t in TIMES]
         info = {"key": cell.key, "spp": 100 + i, "charged_seconds": 16.0, "training_passes": 3 + i, "train_seconds": 2.0 + i,
                 "render_seconds": 14.0 - i, "compile_seconds": 5.0 if i == 0 else 0.0, "wait_fraction": 0.1 * i,
-                "records": 1000 + i, "bytes_per_record": 256, "particles": 50_000,
+                "records": 1000 + i, "bytes_per_record": 256, "particles": 50_000, "image_passes": 10,
                 "mean": 1 + error, "mean_stderr": 0.3}
         trace = [{"seconds": t, "spp": t} for t in TIMES]
         results.write_cell(cell.scene.name, cell.method.name, cell.seed, info, trace,
-                           {"mean": images[-1], "variance": truth, "count": truth[..., 0]}, images, cell.config())
+                           {"mean": images[-1], "variance": (0.1 * error) ** 2 * truth, "count": truth[..., 0]}, images,
+                           cell.config())
     reference = Reference(truth, truth.copy(), truth, truth, {"spp_a": 1, "spp_b": 1})
     return SimpleNamespace(experiment=experiment, results=results, references={"door_ajar": reference})
 
@@ -72,8 +74,11 @@ def test_figures_over_seeds(known):
     assert row["l1_low"] == pytest.approx(0.41, rel=1e-6) and row["l1_high"] == pytest.approx(0.86, rel=1e-6)
     assert row["relmse"] == pytest.approx(0.25 / 1.01, rel=1e-6) == row["relmse_trimmed"]
     assert row["mean"] == pytest.approx(1.6) and row["mean_stderr"] == pytest.approx(0.3 / np.sqrt(3))
-    Y = np.array([1.4, 1.5, 1.9])
-    assert row["work_normalised_variance"] == pytest.approx(16 * Y.var(ddof=1) / (1.001 * Y.mean() ** 2), rel=1e-6)
+    variance = 16 * 0.01 * np.mean(np.square(ERRORS["Slow"])) / 1.001       # over the reference, which is 1
+    for kind in ("", "_trimmed", "_mean"):
+        assert row[f"work_normalised_variance{kind}"] == pytest.approx(variance, rel=1e-6)
+        assert row[f"gain{kind}"] == row[f"gain{kind}_low"] == row[f"gain{kind}_high"] == 1
+    assert row["variance_passes"] == 30 and row["undefined"] == []
     assert (row["train_seconds"], row["render_seconds"]) == (3, 13)
     assert (row["compile_seconds"], row["wait_fraction"]) == (5, 0.2)
     assert (row["spp"], row["records"], row["bytes_per_record"], row["particles"]) == (101, 1001, 256, 50_000)
@@ -90,6 +95,8 @@ def test_one_seed_has_no_variance_and_json_has_no_nan(tmp_path):
     known = folder(tmp_path, {"Alone": [0.5]}, [0])
     result = summarised(known)
     assert result["rows"][0]["work_normalised_variance"] is None and result["rows"][0]["gain"] is None
+    reason = "there is no variance and no gain, since an interval needs at least 3 seeds, and there is 1"
+    assert result["rows"][0]["undefined"] == [reason]
     summary.write(result, known.results)
     written = json.loads((known.results.folder / "summary.json").read_text(), parse_constant=pytest.fail)
     assert written == result
@@ -109,12 +116,16 @@ def test_a_scene_without_reference_has_no_errors_but_all_the_rest(known):
         errors = [*KEYS[KEYS.index("l1"):KEYS.index("ssim_error") + 1], "speed_up", "speed_up_low", "speed_up_high",
                   "worst_speed_up", "noise_floor"]
         assert [row[key] for key in errors] == [None] * len(errors)
-        assert {k: v for k, v in row.items() if k not in errors} == {k: v for k, v in full.items() if k not in errors}
+        # Variances are relative to another mean, that of all cells.
+        rest = [key for key in KEYS if key not in errors and not key.startswith("work_normalised_variance")]
+        gains = [key for key in rest if key.startswith("gain")]
+        assert {key: row[key] for key in rest if key not in gains} == {key: full[key] for key in rest if key not in gains}
+        assert [row[key] for key in gains] == pytest.approx([full[key] for key in gains], rel=1e-4)
     assert finished.read(without_reference(known).experiment, known.results, {}).speed_ups == {"Fast": {}}
     console = Console(file=io.StringIO(), width=200)
     summary.print_table({"rows": rows}, console)
     shown = console.file.getvalue().splitlines()[2].split()
-    assert shown[:6] == ["Slow", "-", "-", "-", "-", summary.number(rows[0]["work_normalised_variance"])]
+    assert shown[:7] == ["Slow", "-", "-", "-", "-", "1.00", "(1.00-1.00)"]
 
 
 def test_images_without_error_have_no_curve_and_no_speed_up(tmp_path):
@@ -191,15 +202,16 @@ def test_methods_whose_means_differ_are_told(known):
         edit(cell, mean=4.0, mean_stderr=0.01)
     slow, fast = summarised(known)["rows"]
     assert slow["apart"] == 0 and fast["apart"] == pytest.approx((4 - slow["mean"]) / (0.3 / 3 ** 0.5), rel=0.2)
-    assert told() == [f"door_ajar / Fast: its mean image is {fast['apart']:.0f} standard errors from the baseline's: one of the "
-                      "two is biased, or has too few samples to know its error"]
+    assert told() == [f"door_ajar / Fast: its mean image is {fast['apart']:.0f} standard errors from the baseline's, in "
+                      "the whole or in a block: one of the two is biased, or has too few samples to know its error"]
 
 
 def test_what_a_cell_does_not_know_is_null(known):
     path = known.results.cell_folder("door_ajar", "Slow", 7) / "cell.json"
     edit(path, mean_stderr=None)
     for row in summarised(known)["rows"]:
-        assert row["apart"] == 0 and (row["mean_stderr"] is None) == (row["method"] == "Slow")
+        assert row["apart"] < 6 and row["bias_seen"] is None        # blocks know their error by the variance layer
+        assert (row["mean_stderr"] is None) == (row["method"] == "Slow")
 
 
 def test_a_missing_cell_is_named_with_the_command_that_makes_it(known):

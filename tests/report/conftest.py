@@ -32,7 +32,8 @@ def finished(tmp_path) -> Finished:
         info = {"key": cell.key, "spp": 160, "charged_seconds": 16.0, "training_passes": 0, "train_seconds": TRAINING[name],
                 "training_ended": ENDED[name] and ENDED[name] + 0.1 * cell.seed,
                 "render_seconds": 16 - TRAINING[name], "compile_seconds": 1.0, "wait_fraction": 0.0, "records": 0,
-                "bytes_per_record": 0, "particles": 0, "mean": 0.5, "mean_stderr": 0.01}
+                "bytes_per_record": 0, "particles": 0, "image_passes": 8,
+                "mean": 0.5, "mean_stderr": 0.01}
         results.write_cell(cell.scene.name, name, cell.seed, info, trace,
                            {"mean": images[-1], "variance": truth, "count": truth[..., 0]}, images)
     results.write_json("env.json", {"schema_version": 1, "cpu": "Abacus 2", "threads": 2})

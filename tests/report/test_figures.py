@@ -86,7 +86,7 @@ def test_a_panel_shows_medians_band_floor_slope_and_training():
 
 @pytest.mark.parametrize("interval, text", [
     (statistics.Interval(2.0, 1.5, 2.5), "2\N{MULTIPLICATION SIGN} (1.5\N{EN DASH}2.5)"),
-    (statistics.Interval(2.0, np.nan, np.nan), "2\N{MULTIPLICATION SIGN}"),
+    (statistics.Interval(2.0, np.nan, np.nan), ""),          # no number without its interval
     (statistics.Interval(3.0, np.nan, np.nan, ">"), ">3\N{MULTIPLICATION SIGN}"),
     (statistics.Interval(np.nan, np.nan, np.nan), "")])
 def test_speed_ups_are_short(interval, text):
@@ -146,7 +146,8 @@ def test_from_a_results_folder(finished):
 
 
 def gain_rows(methods: list[str], scenes: list[str]) -> list[dict]:
-    return [{"scene": scene, "method": method, "gain": 2.0 ** i, "gain_low": 1.8 ** i, "gain_high": 2.3 ** i}
+    return [{"scene": scene, "method": method, "gain": 2.0 ** i, "gain_low": 1.8 ** i, "gain_high": 2.3 ** i,
+             "gain_trimmed": 3.0 ** i, "gain_trimmed_low": 2.8 ** i, "gain_trimmed_high": 3.3 ** i}
             for scene in scenes for i, method in enumerate(methods)]
 
 
@@ -154,16 +155,20 @@ def gain_rows(methods: list[str], scenes: list[str]) -> list[dict]:
     (["A"], ["door_ajar"]), (["Quick", "A very long name of a method", "C"], ["door_ajar", "a rather long name of a scene"]),
     ([f"M{i}" for i in range(11)], ["x", "y", "z"])])
 def test_gains_have_a_dot_an_interval_and_a_number_each(methods, scenes):
+    """By the median filled, trimmed hollow; where there is no interval there is no dot either."""
     rows = gain_rows(methods, scenes)
     rows[-1] |= {"gain_low": None, "gain_high": None}
     with figures.style():
         figure = rendered(figures.draw_gains(rows, {name: 1 + i for i, name in enumerate(methods)}, "PT", "Title", "Note."))
     axes = figure.axes[0]
     dots = [line for line in axes.lines if len(line.get_xdata()) == 1]
-    assert [line.get_xdata()[0] for line in dots] == [row["gain"] for row in rows]
-    assert len(axes.lines) == 1 + len(rows) + len(rows) - 1             # 1, dots, intervals
+    expected = [row[column] for row in rows for column in figures.GAINS if row[f"{column}_low"] is not None]
+    assert [line.get_xdata()[0] for line in dots] == expected
+    assert sum(line.get_markerfacecolor() == "white" for line in dots) == len(rows)
+    assert len(axes.lines) == 1 + 2 * len(dots)             # 1, dots, intervals
     texts = [text.get_text() for text in visible(figure)]
-    assert texts.count("1.00 (1.00\N{EN DASH}1.00)") == len(scenes) - (len(methods) == 1)
+    assert texts.count("1.00 (1.00\N{EN DASH}1.00)") == 2 * len(scenes) - (len(methods) == 1)
+    assert texts.count("trimmed") == len(rows)
     low, high = axes.get_xlim()
     assert low < 1 < high and axes.get_xscale() == "log"
     assert_readable(figure)
@@ -177,7 +182,8 @@ def test_gains_from_a_results_folder(finished):
 
 def test_no_gains_without_another_method_or_seed(finished):
     alone = [row for row in summary.summarise(finished)["rows"] if row["method"] == "Path tracing"]
-    one_seed = [{"scene": "door_ajar", "method": method, "gain": None} for method in ("Path tracing", "Quick & dirty")]
+    one_seed = [{"scene": "door_ajar", "method": method, "gain": None, "gain_trimmed": None}
+                for method in ("Path tracing", "Quick & dirty")]
     for rows in (alone, one_seed):
         assert figures.gains(finished, rows) == []
     assert not list(finished.results.folder.glob("gains.*"))

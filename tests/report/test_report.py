@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from small_experiment import edit
 
-from olpm_bench.bench import run, statistics
+from olpm_bench.bench import gains, run, statistics
 from olpm_bench.bench.results import Cell, Results
 from olpm_bench.report import figures, sheet, sweeps
 
@@ -36,12 +36,12 @@ def test_everything_is_read_and_computed_once(reported, monkeypatch):
         monkeypatch.setattr(owner, name, counted)
 
     for owner, name in ((Results, "read_cell"), (Cell, "checkpoints"), (Cell, "image"), (statistics, "speed_up"),
-                        (statistics, "gain"), (sheet, "choose_crops"), (sheet, "relative_error")):
+                        (gains, "gain"), (gains, "estimate"), (sheet, "choose_crops"), (sheet, "relative_error")):
         count(owner, name)
     reported()
     cells, methods = 2 * 3, 2
-    assert calls == {"read_cell": cells, "checkpoints": cells, "image": cells + methods, "speed_up": methods - 1, "gain": methods,
-                     "choose_crops": 1, "relative_error": methods}
+    assert calls == {"read_cell": cells, "checkpoints": cells, "image": cells + methods, "speed_up": methods - 1,
+                     "gain": 3 * methods, "estimate": 3 * methods, "choose_crops": 1, "relative_error": methods}
 
 
 def test_captions_name_the_machines_that_made_the_cells(reported, monkeypatch, capsys):

@@ -41,7 +41,7 @@ def made(tmp_path, reference: str | None = None, passes: tuple[int, ...] = (1, 4
         trained = [{"photons": 1000 * asked, "stored": 10_000 * asked}] if name == "Stored" else (
             [{"photons": 1000, "stored": 10_000}] * min(asked, most))
         info = {"key": cell.key, "records": 100 if asked else 0, "bytes_per_record": 200, "charged_seconds": 1.0,
-                "train_seconds": 0.5 * asked, "passes": trained}
+                "train_seconds": 0.5 * asked, "passes": trained, "mean": 1.0, "mean_stderr": 0.1}
         results.write_cell(cell.scene.name, cell.method.name, cell.seed, info, [{"seconds": 1.0, "train_seconds": 0, "spp": 16}],
                            {"mean": image, "variance": TRUTH, "count": TRUTH[..., 0]}, [image])
     results.write_json("env.json", {"schema_version": 1, "cpu": "Abacus 2", "threads": 2})
@@ -154,7 +154,8 @@ def test_nothing_is_drawn_without_a_sweep(finished):
 @pytest.mark.parametrize("passes", [(1, 4, 16), (1, 2, 4, 16)], ids=["a look each", "a look a sweep"])
 def test_a_method_looks_the_same_in_all_figures(tmp_path, monkeypatch, passes):
     known, colours = made(tmp_path, passes=passes), {}
-    rows = [{"scene": "door_ajar", "method": method.name, "gain": 2.0, "gain_low": 1.5, "gain_high": 2.5}
+    gains = {column + end: value for column in figures.GAINS for end, value in (("", 2.0), ("_low", 1.5), ("_high", 2.5))}
+    rows = [{"scene": "door_ajar", "method": method.name, "variance_passes": 96, **gains}
             for method in known.experiment.method]
 
     def keep(figure, folder, name: str) -> list[str]:
