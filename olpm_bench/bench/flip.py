@@ -103,6 +103,7 @@ def _evaluator() -> other_process.Process:
 
 def _serve() -> None:
     """Answer requests, lines of JSON [path of two images, parameters], by {"mean": HDR-FLIP}."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")     # read by `import`; threads that spin for work take it from others
     import flip_evaluator
 
     answers = os.fdopen(os.dup(1), "w", buffering=1)

@@ -6,7 +6,7 @@ fireflies count, and a pixel that is NaN or infinite makes the metric so.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -118,12 +118,13 @@ METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     f.__name__: f for f in (l1, mape, smape, relmse, relmse_trimmed, flip, ssim_error)}
 
 
-def errors(images: Sequence[np.ndarray], reference: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
+def errors(images: Iterable[np.ndarray], reference: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
     """Every metric of every image (h, w, 3).
 
     Returns:
         Metric -> errors (images), NaN where the metric is undefined or fails; and a sentence on each metric that fails.
     """
+    images = list(images)
     found: dict[str, np.ndarray] = {}
     failures = []
     for name, metric in METRICS.items():
