@@ -6,7 +6,7 @@ fireflies count, and a pixel that is NaN or infinite makes the metric so.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -91,31 +91,22 @@ def ssim_error(x: np.ndarray, r: np.ndarray) -> float:
     return float(1 - structural_similarity(shown_x, shown_r, data_range=1, channel_axis=-1))
 
 
-def work_normalised_variance(images: Sequence[np.ndarray], seconds: float) -> float:
-    """Median over pixels of var / (mean^2 + 1e-3 imagemean^2), times seconds; needs no reference.
-
-    Args:
-        images: one (h, w, 3) per seed; variance (ddof = 1) and mean are those of the luminance over seeds.
-        seconds: charged seconds of one image.
-
-    Returns:
-        NaN where it has no value: a single seed, or black images.
-    """
-    return relative_variance(np.stack([luminance(image) for image in images])) * seconds
-
-
-def relative_variance(Y: np.ndarray) -> float:
-    """Median over pixels of var / (mean^2 + 1e-3 imagemean^2), of luminances (seeds, h, w); NaN as above."""
-    if len(Y) < 2:
-        return float("nan")
-    mean = Y.mean(axis=0)
-    with np.errstate(invalid="ignore"):
-        return float(np.median(Y.var(axis=0, ddof=1) / (mean**2 + 1e-3 * mean.mean() ** 2)))
-
-
 # The registries: a new metric is a function and its name here; summaries, comparisons and claims know it by that.
 METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     f.__name__: f for f in (l1, mape, smape, relmse, relmse_trimmed, flip, ssim_error)}
+
+
+def error(name: str, images: Iterable[np.ndarray], reference: np.ndarray) -> tuple[np.ndarray, str]:
+    """A metric of every image (h, w, 3).
+
+    Returns:
+        The errors (images), NaN where the metric is undefined or fails; and a sentence that says how it failed, or "".
+    """
+    images = list(images)
+    try:
+        return np.array([METRICS[name](image, reference) for image in images], np.float64), ""
+    except (Exception, SystemExit) as failure:      # whatever is wrong with a metric, the others have their values
+        return np.full(len(images), np.nan), f"{name} has no value: {failure or type(failure).__name__}"
 
 
 def errors(images: Iterable[np.ndarray], reference: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -125,19 +116,9 @@ def errors(images: Iterable[np.ndarray], reference: np.ndarray) -> tuple[dict[st
         Metric -> errors (images), NaN where the metric is undefined or fails; and a sentence on each metric that fails.
     """
     images = list(images)
-    found: dict[str, np.ndarray] = {}
-    failures = []
-    for name, metric in METRICS.items():
-        try:
-            found[name] = np.array([metric(image, reference) for image in images], np.float64)
-        except (Exception, SystemExit) as error:        # whatever is wrong with a metric, the others have their values
-            found[name] = np.full(len(images), np.nan)
-            failures.append(f"{name} has no value: {error or type(error).__name__}")
-    return found, failures
+    found = {name: error(name, images, reference) for name in METRICS}
+    return {name: values for name, (values, _) in found.items()}, [failure for _, failure in found.values() if failure]
 
 
-# Of the luminances of all seeds (seeds, h, w) and their charged seconds (seeds); they need no reference.
-OVER_SEEDS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
-    "relative_variance": lambda Y, seconds: relative_variance(Y),
-    "work_normalised_variance": lambda Y, seconds: relative_variance(Y) * float(seconds.mean()),
-}
+# Of all seeds of a method; they need no reference.
+VARIANCES = ("relative_variance", "work_normalised_variance")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import bias, gains, metrics, pixel_variance, statistics
+from olpm_bench.bench import bias, gains, metrics, statistics
 from olpm_bench.bench.bias import APART
 from olpm_bench.bench.clock import WAITED
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
@@ -89,17 +89,6 @@ def summarise(finished: Finished) -> dict[str, Any]:
              for scene in finished.scenes}
     return {"schema_version": SCHEMA_VERSION, "rows": rows,
             "flip_exposures": {name: asdict(e) if e is not None else None for name, e in found.items()}}
-
-
-def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work:
-    """What the cells of a method (one per seed) show and cost; `images` are theirs."""
-    seconds = np.array([cell.info["charged_seconds"] for cell in cells], np.float64)
-    return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
-
-
-def apart(a: Sequence[Cell], b: Sequence[Cell]) -> float:
-    """By how many standard errors the mean images of two methods differ, as `bias.Difference` says; `APART` is too many."""
-    return bias.difference(*(bias.means(cells, pixel_variance.read(cells)) for cells in (a, b))).apart
 
 
 def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, Any]:

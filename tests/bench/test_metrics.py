@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from olpm_bench.bench import flip, metrics
 
@@ -129,23 +128,3 @@ def test_ssim_error_is_that_of_the_tone_mapped_images():
     assert metrics.ssim_error(REFERENCE * 4, REFERENCE * 4) == pytest.approx(0, abs=1e-12)
     x = np.maximum(REFERENCE + RNG.normal(0, 0.1, REFERENCE.shape), 0)
     assert metrics.ssim_error(4 * x, 4 * REFERENCE) == pytest.approx(metrics.ssim_error(x, REFERENCE), rel=1e-3)
-
-
-def test_work_normalised_variance_of_a_known_variance():
-    """Grey pixels of mean 1 and standard deviation s: the median of var is that of s^2 chi^2(n-1) / (n-1)."""
-    n, s = 4, 0.1
-    images = [np.repeat(RNG.normal(1, s, (300, 300, 1)), 3, axis=-1) for _ in range(n)]
-    expected = s**2 * stats.chi2.median(n - 1) / (n - 1) / 1.001
-    assert metrics.work_normalised_variance(images, seconds=7) == pytest.approx(7 * expected, rel=0.02)
-
-
-def test_work_normalised_variance_is_the_same_after_twice_the_time():
-    images = np.repeat(RNG.normal(1, 0.2, (8, 100, 100, 1)), 3, axis=-1)
-    halves = (images[0::2] + images[1::2]) / 2
-    once, twice = (metrics.work_normalised_variance(i, t) for i, t in ((images[:4], 1.0), (halves, 2.0)))
-    assert once == pytest.approx(twice, rel=0.05)
-
-
-def test_work_normalised_variance_needs_two_seeds_and_light():
-    assert np.isnan(metrics.work_normalised_variance([REFERENCE], 1.0))
-    assert np.isnan(metrics.work_normalised_variance([flat(0), flat(0)], 1.0))
