@@ -27,7 +27,7 @@ from olpm_bench import scenes as embedded
 from olpm_bench import shipped, transport
 from olpm_bench.bench import environment
 from olpm_bench.bench.files import SCHEMA_VERSION, slug
-from olpm_bench.bench.metrics import METRICS, OVER_SEEDS
+from olpm_bench.bench.metrics import METRICS, VARIANCES
 from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings, with_changes
 
@@ -205,10 +205,10 @@ class Method(Table):
 
 
 class Claim(Table):
-    """What `olpm-bench gate` proves or refutes: in each scene, one method's error is at most `ratio` times another's.
+    """What `olpm-bench gate` proves or refutes: in each scene, one method's expected error is at most `ratio` times another's.
 
     better, worse: names of methods.
-    metric: an error (of a scene with reference), or a variance over seeds; see `bench.metrics`.
+    metric: an error (of a scene with reference), or the variance of a pixel; see `bench.metrics` and `bench.gate`.
     confidence: of the one-sided bound that must not exceed `ratio`.
     """
     better: str
@@ -220,7 +220,7 @@ class Claim(Table):
     @field_validator("metric")
     @classmethod
     def _known(cls, value: str) -> str:
-        if value not in (known := [*METRICS, *OVER_SEEDS]):
+        if value not in (known := [*METRICS, *VARIANCES]):
             raise ValueError(f"must be one of {', '.join(known)}{closest(value, known)}")
         return value
 

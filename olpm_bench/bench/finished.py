@@ -26,12 +26,14 @@ class Final(NamedTuple):
     """What the final images of a method show.
 
     errors: by metric, one per seed; NaN without reference.
+    failures: a sentence on each metric that failed.
     variances: by `gains.KINDS`, the work-normalised variance [s].
     gains: by `gains.KINDS`, the baseline's work-normalised variance over the method's.
     passes: of all cells, which variances stand on.
     means: of the images, for the bias guard.
     """
     errors: dict[str, np.ndarray]
+    failures: list[str]
     variances: dict[str, statistics.Interval]
     gains: dict[str, statistics.Interval]
     passes: int
@@ -53,26 +55,26 @@ class FinishedScene:
     @cached_property
     def final(self) -> dict[str, Final]:
         """Method -> what its final images show."""
-        errors, variances, guards, radiances = {}, {}, {}, []
+        errors, failures, variances, guards, radiances = {}, {}, {}, {}, []
         for method, cells in self.cells.items():        # one at a time: images take memory
             images = pixel_variance.read(cells)
-            errors[method] = self._errors(images.mean)
+            errors[method], failures[method] = self._errors(images.mean)
             variances[method] = gains.work_variance(method, images)
             guards[method] = bias.means(cells, images)
             radiances.append(images.mean.mean(axis=0))
         radiance = self.reference.mean if self.reference is not None else np.mean(radiances, axis=0)
         normalised = {method: gains.normalised(variance, radiance) for method, variance in variances.items()}
         baseline = normalised[self.baseline]
-        return {method: Final(errors[method], {kind: gains.estimate(variance, kind) for kind in gains.KINDS},
+        return {method: Final(errors[method], failures[method],
+                              {kind: gains.estimate(variance, kind) for kind in gains.KINDS},
                               {kind: gains.gain(baseline, variance, kind) for kind in gains.KINDS}, variance.passes,
                               guards[method])
                 for method, variance in normalised.items()}
 
-    def _errors(self, images: np.ndarray) -> dict[str, np.ndarray]:
+    def _errors(self, images: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
         if self.reference is None:
-            return {name: np.full(len(images), np.nan) for name in metrics.METRICS}
-        truth = self.reference.mean
-        return {name: np.array([metric(image, truth) for image in images]) for name, metric in metrics.METRICS.items()}
+            return {name: np.full(len(images), np.nan) for name in metrics.METRICS}, []
+        return metrics.errors(images, self.reference.mean)
 
     def curves(self, over: str = "seconds") -> dict[str, statistics.Curve]:
         """Method -> its L1 error over a column of the traces: charged seconds, or "spp".  There must be a reference.

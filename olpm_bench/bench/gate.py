@@ -1,29 +1,35 @@
 """Claims of an experiment, put to the test: is one method better than another by the factor that the file states?
 
-Seeds are paired.  The ratio of two errors is the geometric mean over seeds of the paired ratios, bounded from above by a
-bootstrap over seeds; that of two variances is of all seeds together, bounded by a jackknife.  A claim holds if that bound does
-not exceed what it states, and so never for a lack of data; nor where the mean images of the two differ: who is biased is not
-better.  All claims must hold, which needs no correction for their number.
+What a claim is about is a ratio of expectations.  For an error that is the ratio of the expected errors of the image of one
+seed.  For a variance it is the ratio of the variances of a pixel in the image of one cell, relative to the squared radiance
+around it as gains have it, averaged over all pixels; work-normalised, each is multiplied by the charged seconds of its cell.
+Both come as one number a seed and method, whose expectation is what the claim is about, and seeds are paired.
+
+A claim holds if the upper bound of :mod:`olpm_bench.bench.ratio_bound` does not exceed what it states, and so never for a lack
+of data.  A variance that is a mean over pixels has few pixels that matter, so its bound allows for three more outliers as large
+as the largest that was seen (rule of three).  A claim does not hold where the mean images of the two differ: who is biased is
+not better.  All claims must hold, which needs no correction for their number.
 """
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import bias, metrics, statistics
+from olpm_bench.bench import bias, gains, metrics, pixel_variance
 from olpm_bench.bench.config import Claim, ConfigError, Experiment
 from olpm_bench.bench.files import SCHEMA_VERSION
+from olpm_bench.bench.pixel_variance import CellImages
+from olpm_bench.bench.ratio_bound import MIN_SEEDS, ratio_bound
 from olpm_bench.bench.reference_file import Reference
-from olpm_bench.bench.results import Cell, Results
-from olpm_bench.bench.summary import complete_cells, difference, number, print_whole, work
+from olpm_bench.bench.results import Results
+from olpm_bench.bench.statistics import Interval
+from olpm_bench.bench.summary import complete_cells, number, print_whole
 from olpm_bench.bench.terminal import plain_console
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-LEAST_SEEDS = 8
 
 
 @dataclass(frozen=True)
@@ -54,18 +60,19 @@ class Verdict:
 def check(experiment: Experiment) -> None:
     """
     Raises:
-        ConfigError: no claims, fewer seeds than 8, or an error of a scene that does without a reference.
+        ConfigError: no claims, fewer seeds than `MIN_SEEDS`, or an error of a scene that does without a reference.
     """
     name = experiment.path.name
     if not experiment.claim:
         raise ConfigError(f'{name} claims nothing: a [[claim]] has keys {", ".join(Claim.model_fields)}')
-    if len(experiment.seeds) < LEAST_SEEDS:
-        raise ConfigError(f"{name}: seeds = {len(experiment.seeds)}: a claim needs at least {LEAST_SEEDS}")
+    if len(experiment.seeds) < MIN_SEEDS:
+        raise ConfigError(f"{name}: seeds = {len(experiment.seeds)}: a claim needs at least {MIN_SEEDS}, "
+                          "since rare events leave no trace in fewer")
     for claim in experiment.claim:
         for scene in experiment.scene:
             if claim.metric in metrics.METRICS and not scene.has_reference:
                 raise ConfigError(f"{name}: metric = {claim.metric!r} needs a reference, and scene {scene.name!r} does without; "
-                                  f"known without: {', '.join(metrics.OVER_SEEDS)}")
+                                  f"known without: {', '.join(metrics.VARIANCES)}")
 
 
 def judge(experiment: Experiment, results: Results, references: dict[str, Reference]) -> list[Verdict]:
@@ -79,29 +86,43 @@ def judge(experiment: Experiment, results: Results, references: dict[str, Refere
     verdicts = []
     for claim in experiment.claim:
         for scene in experiment.scene:
-            better, worse = cells[scene.name, claim.better], cells[scene.name, claim.worse]
-            ratio = _ratio(claim, better, worse, references.get(scene.name))
-            verdicts.append(Verdict(scene.name, claim, ratio.value, ratio.low, ratio.high, difference(better, worse)))
+            both = [cells[scene.name, method] for method in (claim.better, claim.worse)]
+            better, worse = (pixel_variance.read(group) for group in both)
+            found = ratio(claim, better, worse, references.get(scene.name))
+            means = [bias.means(group, images) for group, images in zip(both, (better, worse), strict=True)]
+            verdicts.append(Verdict(scene.name, claim, found.value, found.low, found.high, bias.difference(*means)))
     return verdicts
 
 
-def _ratio(claim: Claim, better: list[Cell], worse: list[Cell], reference: Reference | None) -> statistics.Interval:
-    n = len(better)
-    images = [[cell.image()["mean"] for cell in cells] for cells in (better, worse)]
-    if claim.metric in metrics.OVER_SEEDS:
-        variance = metrics.OVER_SEEDS[claim.metric]
-        works = work(better, images[0]), work(worse, images[1])
+def ratio(claim: Claim, better: CellImages, worse: CellImages, reference: Reference | None) -> Interval:
+    """What a claim is about, with bounds that hold with its confidence each.
 
-        def of_variances(index: np.ndarray) -> float:
-            a, b = (variance(w.luminance[index], w.seconds[index]) for w in works)
-            return a / b if b > 0 else float("nan")
-        return statistics.jackknife(of_variances, n, confidence=claim.confidence)
+    Args:
+        better, worse: images of as many seeds.
+        reference: of the scene; only variances do without.
+    """
+    if claim.metric in metrics.VARIANCES:
+        return _ratio_of_variances(claim, better, worse, reference)
     assert reference is not None
-    metric = metrics.METRICS[claim.metric]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (np.log([metric(image, reference.mean) for image in method]) for method in images)
-        return statistics.bootstrap(lambda index: float(np.exp(np.mean(a[index] - b[index]))), n,
-                                    band=statistics.expanded_band(claim.confidence, n))
+    of_better, of_worse = (metrics.error(claim.metric, images.mean, reference.mean)[0] for images in (better, worse))
+    return ratio_bound(of_better, of_worse, claim.confidence)
+
+
+def _ratio_of_variances(claim: Claim, better: CellImages, worse: CellImages, reference: Reference | None) -> Interval:
+    """The ratio of the mean variances of a pixel."""
+    both = [better, worse]
+    if claim.metric == "relative_variance":
+        both = [replace(images, seconds=np.ones(len(images))) for images in both]
+    radiance = reference.mean if reference is not None else np.mean([images.mean.mean(axis=0) for images in both], axis=0)
+    of_better, of_worse = (gains.normalised(gains.work_variance(name, images), radiance).by_cell
+                           for name, images in zip((claim.better, claim.worse), both, strict=True))
+    seeds_of_better, seeds_of_worse = (v.mean(axis=(1, 2), dtype=np.float64) for v in (of_better, of_worse))
+    return ratio_bound(seeds_of_better, seeds_of_worse, claim.confidence, (_unseen(of_better), _unseen(of_worse)))
+
+
+def _unseen(variances: np.ndarray) -> float:
+    """What the mean of (seeds, h, w) would grow by with three more outliers as large as the largest."""
+    return gains.UNSEEN * float(variances.max()) / variances.size
 
 
 def write(verdicts: list[Verdict], results: Results) -> None:

@@ -6,10 +6,11 @@ fireflies count, and a pixel that is NaN or infinite makes the metric so.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from olpm_bench.bench import flip as hdr_flip
 from olpm_bench.report import tonemap
 
 EPSILON = 0.01          # of the relative metrics, in units of radiance
@@ -79,14 +80,9 @@ def relmse_trimmed(x: np.ndarray, r: np.ndarray) -> float:
 
 
 def flip(x: np.ndarray, r: np.ndarray) -> float:
-    """Mean HDR-FLIP [Andersson et al. 2021], whose range of exposures comes from the reference alone."""
-    import flip_evaluator
-
+    """Mean HDR-FLIP at the exposures that the reference fixes; NaN for a black one: see `olpm_bench.bench.flip`."""
     _pair(x, r)
-    if not (np.isfinite(x).all() and np.isfinite(r).all()):
-        return float("nan")
-    test, reference = (np.maximum(image, 0).astype(np.float32) for image in (x, r))
-    return float(flip_evaluator.evaluate(reference, test, "HDR", applyMagma=False)[1])
+    return hdr_flip.flip(x, r)
 
 
 def ssim_error(x: np.ndarray, r: np.ndarray) -> float:
@@ -101,33 +97,34 @@ def ssim_error(x: np.ndarray, r: np.ndarray) -> float:
     return float(1 - structural_similarity(shown_x, shown_r, data_range=1, channel_axis=-1))
 
 
-def work_normalised_variance(images: Sequence[np.ndarray], seconds: float) -> float:
-    """Median over pixels of var / (mean^2 + 1e-3 imagemean^2), times seconds; needs no reference.
-
-    Args:
-        images: one (h, w, 3) per seed; variance (ddof = 1) and mean are those of the luminance over seeds.
-        seconds: charged seconds of one image.
-
-    Returns:
-        NaN where it has no value: a single seed, or black images.
-    """
-    return relative_variance(np.stack([luminance(image) for image in images])) * seconds
-
-
-def relative_variance(Y: np.ndarray) -> float:
-    """Median over pixels of var / (mean^2 + 1e-3 imagemean^2), of luminances (seeds, h, w); NaN as above."""
-    if len(Y) < 2:
-        return float("nan")
-    mean = Y.mean(axis=0)
-    with np.errstate(invalid="ignore"):
-        return float(np.median(Y.var(axis=0, ddof=1) / (mean**2 + 1e-3 * mean.mean() ** 2)))
-
-
 # The registries: a new metric is a function and its name here; summaries, comparisons and claims know it by that.
 METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     f.__name__: f for f in (l1, mape, smape, relmse, relmse_trimmed, flip, ssim_error)}
-# Of the luminances of all seeds (seeds, h, w) and their charged seconds (seeds); they need no reference.
-OVER_SEEDS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
-    "relative_variance": lambda Y, seconds: relative_variance(Y),
-    "work_normalised_variance": lambda Y, seconds: relative_variance(Y) * float(seconds.mean()),
-}
+
+
+def error(name: str, images: Iterable[np.ndarray], reference: np.ndarray) -> tuple[np.ndarray, str]:
+    """A metric of every image (h, w, 3).
+
+    Returns:
+        The errors (images), NaN where the metric is undefined or fails; and a sentence that says how it failed, or "".
+    """
+    images = list(images)
+    try:
+        return np.array([METRICS[name](image, reference) for image in images], np.float64), ""
+    except (Exception, SystemExit) as failure:      # whatever is wrong with a metric, the others have their values
+        return np.full(len(images), np.nan), f"{name} has no value: {failure or type(failure).__name__}"
+
+
+def errors(images: Iterable[np.ndarray], reference: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Every metric of every image (h, w, 3).
+
+    Returns:
+        Metric -> errors (images), NaN where the metric is undefined or fails; and a sentence on each metric that fails.
+    """
+    images = list(images)
+    found = {name: error(name, images, reference) for name in METRICS}
+    return {name: values for name, (values, _) in found.items()}, [failure for _, failure in found.values() if failure]
+
+
+# Of all seeds of a method; they need no reference.
+VARIANCES = ("relative_variance", "work_normalised_variance")

@@ -6,8 +6,8 @@ A result folder (`results/<stem of the TOML>`):
     {figure,gains,sweep}.{png,pdf,svg}  crops.{png,pdf}
     cells/<scene>/<method>/<seed>/cell.json         written last: with it the cell is complete
                                   trace.jsonl       one line a checkpoint
-                                  image.exr         parts mean, variance (of the mean), count
-                                  checkpoints.exr   parts 0, 1, ...: the mean at each line of the trace
+                                  image.exr         layers mean, variance (of the mean), count
+                                  checkpoints.exr   layers 0, 1, ...: the mean at each line of the trace
                                   failed.json       why there is no cell.json
                                   lock              who is at work on it
 

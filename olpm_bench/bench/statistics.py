@@ -14,7 +14,6 @@ from scipy import special
 from olpm_bench.transport.settings import InputError
 
 BAND = (5.0, 95.0)          # [%]
-RESAMPLES = 2000
 
 
 class Band(NamedTuple):
@@ -45,12 +44,6 @@ class Curve(NamedTuple):
     @property
     def median(self) -> np.ndarray:
         return np.median(self.errors, axis=0)
-
-
-class Work(NamedTuple):
-    """Final images of several seeds and what they cost: luminance (seeds, h, w), charged seconds (seeds)."""
-    luminance: np.ndarray
-    seconds: np.ndarray
 
 
 def median_band(values: Sequence[float] | np.ndarray) -> Band:
@@ -119,31 +112,14 @@ def time_to_error(times: np.ndarray, errors: np.ndarray, error: float) -> float:
     return float(np.exp(np.interp(-np.log(error), -log_e, log_t)))
 
 
-def bootstrap(statistic: Callable[[np.ndarray], float], n: int, seed: int = 0,
-              band: tuple[float, float] = BAND) -> Interval:
-    """Percentile bootstrap of a statistic of seeds, which gets their numbers (n,) and so resamples methods in pairs.
-
-    Args:
-        band: percentiles of the resampled statistic that bound the interval.
-
-    Returns:
-        The interval is NaN with a single seed, and where some resample has no value.
-    """
-    value = float(statistic(np.arange(n)))
-    if n == 1:
-        return Interval(value, float("nan"), float("nan"))
-    drawn = np.random.default_rng(seed).integers(0, n, (RESAMPLES, n))
-    low, high = np.percentile([statistic(index) for index in drawn], band)
-    return Interval(value, float(low), float(high))
-
-
 def jackknife(statistic: Callable[[np.ndarray], float], n: int, confidence: float = BAND[1] / 100) -> Interval:
     """Interval of a positive statistic of seeds from its logarithm without one of them at a time (Tukey 1958), by Student's t.
 
     For statistics that count how often a seed was drawn, as variances do: a bootstrap draws some twice.
 
     Args:
-        statistic, n: as in `bootstrap`.
+        statistic: of seeds, which gets their numbers and so leaves one out of all methods at once.
+        n: number of seeds.
         confidence: that of each end.
 
     Returns:
@@ -157,17 +133,6 @@ def jackknife(statistic: Callable[[np.ndarray], float], n: int, confidence: floa
         without = np.log([statistic(np.delete(seeds, i)) for i in seeds])
         reach = np.exp(special.stdtrit(n - 1, confidence) * np.sqrt((n - 1) * np.var(without)))
     return Interval(value, float(value / reach), float(value * reach))
-
-
-def expanded_band(confidence: float, n: int) -> tuple[float, float]:
-    """Percentiles whose ends each bound a statistic of `n` seeds with the given confidence.
-
-    Percentiles of a bootstrap are too near the estimate, by sqrt((n - 1) / n) and by taking Student's t for a normal: those
-    that make up for both, exactly so for the mean of normal values ("expanded percentile", Hesterberg 2015, What Teachers Should
-    Know About the Bootstrap).  For 8 seeds, the percentile 97.9 stands for 95 %.
-    """
-    high = 100 * special.ndtr(np.sqrt(n / (n - 1)) * special.stdtrit(n - 1, confidence))
-    return float(100 - high), float(high)
 
 
 def speed_up(baseline: Curve, method: Curve, error: float | None = None, least: float = 0.0) -> Interval:

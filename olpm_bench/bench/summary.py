@@ -8,14 +8,16 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olpm_bench.bench import advice, bias, gains, metrics, pixel_variance, statistics
+from olpm_bench.bench import advice, bias, gains, metrics, statistics
 from olpm_bench.bench.bias import APART
 from olpm_bench.bench.clock import MAX_WAITED, UNRELIABLE
 from olpm_bench.bench.files import SCHEMA_VERSION, ResultError, plain
+from olpm_bench.bench.flip import exposures
 from olpm_bench.bench.results import Cell, Results, warnings
 from olpm_bench.bench.terminal import plain_console
 
@@ -59,15 +61,19 @@ def _agrees(stored: Any, now: Any) -> bool:
 
 
 def summarise(finished: Finished) -> dict[str, Any]:
-    """The summary of an experiment: ``{"schema_version", "rows"}``, one row a scene and method, in the TOML's order.
+    """The summary of an experiment: ``{"schema_version", "rows", "flip_exposures"}``.
+
+    There is one row a scene and method, in the TOML's order, and by scene the `flip.Exposures` of HDR-FLIP, None without a
+    reference or with a black one.
 
     Over seeds, a figure is the median, also each of `metrics.METRICS`; but `l1_low` and `l1_high` are the 5 and 95 %
     quantiles, `mean` is the mean of `metrics.mean` with its standard error, `compile_seconds` and `wait_fraction` are the
     largest, and `overrun` is the largest share by which a cell exceeds a budget in seconds.  `noise_floor` is the reference's.
     `work_normalised_variance` [s] and `gain` are those of :mod:`olpm_bench.bench.gains` by the median, with `_trimmed` and
     `_mean` by the means over pixels, each with its 90 % interval; `variance_passes` are the passes of all cells that they
-    stand on, and `undefined` says which of them there are not and why.  `speed_up` is how many times as fast it is to
-    equal L1 (at least, or at most, by `speed_up_bound` ">" or "<"), `worst_speed_up` by `statistics.worst_speed_up`.
+    stand on, and `undefined` says which of them, and which metrics, there are not and why.  `speed_up` is how many times as
+    fast it is to equal L1 (at least, or at most, by `speed_up_bound` ">" or "<"), `worst_speed_up` by
+    `statistics.worst_speed_up`.
     `apart`, `bias_seen` and `block_bias_seen` are the `bias.Difference` from the baseline, `memory` is by `Cell.memory`
     [bytes], and `guided` the share of the surfaces that the camera sees whose records have learnt enough to guide;
     `warnings` are those of training.  What has no value (a spread of one seed, the error of a scene without reference,
@@ -75,19 +81,10 @@ def summarise(finished: Finished) -> dict[str, Any]:
     """
     budget = finished.experiment.budget.seconds
     rows = [_row(scene, method, budget) for scene in finished.scenes for method in scene.cells]
-    return {"schema_version": SCHEMA_VERSION, "rows": rows}
-
-
-def work(cells: Sequence[Cell], images: Sequence[np.ndarray]) -> statistics.Work:
-    """What the cells of a method (one per seed) show and cost; `images` are theirs."""
-    seconds = np.array([cell.info["charged_seconds"] for cell in cells], np.float64)
-    return statistics.Work(np.stack([metrics.luminance(image) for image in images]), seconds)
-
-
-def difference(a: Sequence[Cell], b: Sequence[Cell]) -> bias.Difference:
-    """How far the mean images of two methods are apart; each image is read once."""
-    of_a, of_b = (bias.means(cells, pixel_variance.read(cells)) for cells in (a, b))
-    return bias.difference(of_a, of_b)
+    found = {scene.scene.name: exposures(scene.reference.mean) if scene.reference is not None else None
+             for scene in finished.scenes}
+    return {"schema_version": SCHEMA_VERSION, "rows": rows,
+            "flip_exposures": {name: asdict(e) if e is not None else None for name, e in found.items()}}
 
 
 def _row(scene: FinishedScene, method: str, budget: float | None) -> dict[str, Any]:
@@ -135,13 +132,13 @@ def _by_kind(name: str, found: Mapping[str, statistics.Interval]) -> dict[str, f
 
 
 def undefined(final: Final) -> list[str]:
-    """Which of a method's variances and gains there are not, and why, a sentence for each reason."""
+    """Which of a method's variances, gains and metrics there are not, and why, a sentence for each reason."""
     reasons: dict[str, list[str]] = {}
     for noun, found in (("variance", final.variances), ("gain", final.gains)):
         for reason in dict.fromkeys(interval.why for interval in found.values() if interval.why):
             kinds = [kind for kind, interval in found.items() if interval.why == reason]
             reasons.setdefault(reason, []).append(noun if kinds == list(found) else f"{noun} by {' or '.join(kinds)}")
-    return [f"there is no {' and no '.join(nouns)}, since {reason}" for reason, nouns in reasons.items()]
+    return [f"there is no {' and no '.join(nouns)}, since {reason}" for reason, nouns in reasons.items()] + final.failures
 
 
 def _whole(value: np.floating) -> int:

@@ -81,6 +81,28 @@ def test_invalid_pixels_are_counted_and_never_repaired(folder):
     assert "a.exr: 2 pixels are NaN, infinite or negative" in call("a.exr", "r.exr").stdout
 
 
+def test_a_black_reference_costs_flip_and_the_table_stays(folder):
+    write_exr(folder / "black.exr", {"": 0 * TRUTH})
+    found = json.loads(call("a.exr", "b.exr", "--reference", "black.exr", "--json").stdout)
+    assert [shown["flip"] for shown in found["images"]] == [None, None] and found["flip_exposures"] is None
+    assert all(shown["l1"] > 0 for shown in found["images"])
+    result = call("a.exr", "b.exr", "--reference", "black.exr")
+    assert result.exit_code == 0 and ["flip", "-", "-"] in [line.split() for line in result.stdout.splitlines()]
+
+
+def test_a_metric_that_fails_is_named_below_the_table(folder, monkeypatch):
+    def fails(x, r):
+        raise ValueError("too dark")
+    monkeypatch.setitem(metrics.METRICS, "flip", fails)
+    result = call("a.exr", "b.exr", "--reference", "r.exr")
+    assert result.exit_code == 0 and "flip has no value: too dark" in result.stdout
+
+
+def test_the_exposures_of_flip_are_recorded(folder):
+    found = json.loads(call("a.exr", "r.exr", "--json").stdout)["flip_exposures"]
+    assert found["start"] < found["stop"] and found["count"] == int(np.ceil(found["stop"] - found["start"]))
+
+
 @pytest.mark.parametrize("arguments, words", [
     (("a.exr", "small.exr"), ["a.exr is 24x16, small.exr is 12x8", "one size"]),
     (("a.exr", "b.exr", "--reference", "small.exr"), ["small.exr is 12x8"]),

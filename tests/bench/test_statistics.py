@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from olpm_bench.bench import statistics
 
@@ -132,29 +131,6 @@ def test_pairing_removes_what_the_seeds_share():
     slow, fast = curve(*(4 * shared)), curve(*(2 * shared * own))
     interval = statistics.speed_up(slow, fast)
     assert 3.88 < interval.low <= interval.value <= interval.high < 4.12
-
-
-def test_bootstrap_repeats_and_needs_two_seeds():
-    data = np.random.default_rng(3).normal(size=9)
-    intervals = [statistics.bootstrap(lambda index: data[index].mean(), 9) for _ in range(2)]
-    assert intervals[0] == intervals[1] and intervals[0].low < data.mean() < intervals[0].high
-    single = statistics.bootstrap(lambda index: 7.0, 1)
-    assert single.value == 7 and np.isnan([single.low, single.high]).all()
-
-
-@pytest.mark.slow
-def test_bootstrap_interval_covers_the_truth_as_often_as_it_says():
-    """Mean of 25 normal values.  The interval is z std(ddof=0) / sqrt(n), whose coverage is known."""
-    n, trials, significance = 25, 300, 1e-4
-    rng = np.random.default_rng(4)
-    covered = 0
-    for trial in range(trials):
-        data = rng.normal(size=n)
-        low, high = statistics.bootstrap(lambda index, data=data: data[index].mean(), n, seed=trial)[1:3]
-        covered += low <= 0 <= high
-    z = stats.norm.ppf(0.95) * np.sqrt((n - 1) / n)
-    expected = stats.t.cdf(z, n - 1) - stats.t.cdf(-z, n - 1)       # 0.88
-    assert stats.binomtest(covered, trials, expected).pvalue > significance
 
 
 def test_curves_that_share_no_time_are_told_by_their_ends():

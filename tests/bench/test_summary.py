@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 from small_experiment import edit
 
-from olpm_bench.bench import config, experiment_file, finished, statistics, summary
+from olpm_bench.bench import config, experiment_file, finished, metrics, statistics, summary
 from olpm_bench.bench.files import ResultError
 from olpm_bench.bench.reference_file import Reference
 from olpm_bench.bench.results import Results
@@ -62,7 +62,7 @@ def summarised(known) -> dict:
 
 def test_rows_have_the_agreed_keys_in_the_order_of_the_toml(known):
     result = summarised(known)
-    assert list(result) == ["schema_version", "rows"] and result["schema_version"] == 1
+    assert list(result) == ["schema_version", "rows", "flip_exposures"] and result["schema_version"] == 1
     assert [row["method"] for row in result["rows"]] == ["Slow", "Fast"]
     assert all(list(row) == KEYS for row in result["rows"])
 
@@ -89,6 +89,33 @@ def test_every_metric_is_a_median_over_seeds(known):
     row = summarised(known)["rows"][0]
     assert row["smape"] == pytest.approx(2 * 0.5 / 2.51, rel=1e-6) and row["mape"] == pytest.approx(0.5 / 1.01, rel=1e-6)
     assert 0 < row["flip"] < 1 and row["ssim_error"] is None        # smaller than the window of SSIM
+
+
+def test_a_metric_that_fails_costs_its_column_and_is_named_below_the_table(known, monkeypatch, capsys):
+    def fails(x, r):
+        raise ValueError("no light")
+    monkeypatch.setitem(metrics.METRICS, "flip", fails)
+    result = summarised(known)
+    assert [row["flip"] for row in result["rows"]] == [None, None] and result["rows"][0]["l1"] == pytest.approx(0.5)
+    assert all(row["undefined"] == ["flip has no value: no light"] for row in result["rows"])
+    summary.print_metrics(result, Console(width=200))
+    assert capsys.readouterr().out.count("flip has no value: no light") == 1
+
+
+@pytest.mark.parametrize("radiance", [0.0, 1e-9])
+def test_a_black_or_dim_scene_ends_with_a_table(known, radiance, capsys):
+    truth = np.full((5, 6, 3), radiance, np.float32)
+    known.references["door_ajar"] = Reference(truth, truth.copy(), truth, truth, {"spp_a": 1, "spp_b": 1})
+    result = summarised(known)
+    assert (result["rows"][0]["flip"] is None) == (radiance == 0) == (result["flip_exposures"]["door_ajar"] is None)
+    summary.print_table(result, Console(width=200))
+    summary.print_metrics(result, Console(width=200))
+    assert capsys.readouterr().out.count("Slow") > 1
+
+
+def test_the_exposures_of_flip_are_those_of_the_reference(known):
+    found = summarised(known)["flip_exposures"]["door_ajar"]        # of luminance 1
+    assert found["start"] == found["stop"] == pytest.approx(np.log2(2.11887), abs=1e-3) and found["count"] == 2
 
 
 def test_one_seed_has_no_variance_and_json_has_no_nan(tmp_path):
