@@ -169,7 +169,8 @@ class _Candidates:
         p, weight, d, _, n = particles.read(particles.place)
         grid = Grid.over(cache.bbox, cache.radius / 2 ** level)
         n_voxels = grid.n_cells // 6
-        order, _, self.offset = group(dr.select(weight > 0, grid.voxel(p), dr.opaque(mi.UInt32, n_voxels)), n_voxels)
+        used = (weight > 0) & grid.covers(p)
+        order, _, self.offset = group(dr.select(used, grid.voxel(p), dr.opaque(mi.UInt32, n_voxels)), n_voxels)
         self.hit = order
         self.p, self.d, self.n = (dr.gather(type(v), v, order) for v in (p, d, n))
         self.grid, self.record, self.n_records = grid, record, len(record)
