@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from olpm_bench.transport.cache import CELL, Grid
+from olpm_bench.transport.cache import CELL, MOST_CELLS, Grid
 from olpm_bench.transport.particles import emit_importons
 from olpm_bench.transport.settings import UNBOUNDED_DEPTH
 
@@ -174,7 +174,8 @@ def _covered(surfaces: np.ndarray, seen: np.ndarray, median: np.ndarray, record_
     """
     edge = CELL * record_radius * scale
     cube = np.full(3, scale / 3 ** 0.5)
-    limit = max(MODERATE_CELLS, MODERATE_CUBES * Grid.cells_over(cube, edge))
+    cells = Grid.cells_over(cube, edge)         # at least those of the seen box, unless segments have limited the scale
+    limit = max(MODERATE_CELLS, cells, min(MODERATE_CUBES * cells, MOST_CELLS))
 
     def fits(corners: np.ndarray) -> bool:
         return Grid.cells_over(corners[1] - corners[0], edge) <= limit
