@@ -26,7 +26,7 @@ import numpy as np
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.emission import EmissionGuide, distant_lights
-from olpm_bench.transport.gather import GATHERS, Gathered, binned, by_record
+from olpm_bench.transport.gather import GATHERS, Gathered, by_record, pooled
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
 from olpm_bench.transport.roulette import PixelEstimate
@@ -311,7 +311,7 @@ class Training:
             with _Seconds(statistics, "gather"):
                 batch = ParticleBatch.empty(guide.records)
                 if self.settings.learn_radiance:
-                    batch = binned(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
+                    batch = pooled(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
             if len(place):          # a record serves some of them
                 with _Seconds(statistics, "update"):
