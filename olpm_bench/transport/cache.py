@@ -51,7 +51,7 @@ SPLIT, UNKNOWN, MISSING = 1 << 31, 1 << 30, (1 << 31) - 1
 
 @dataclass
 class Grid:
-    """Voxels over the scene's bounding box times six normal directions.  Scalars are opaque: no kernel depends on them."""
+    """Voxels over a box times six normal directions.  Scalars are opaque: no kernel depends on them."""
     origin: mi.Point3f
     inverse_edge: mi.Float
     size: mi.Vector3u
@@ -64,18 +64,33 @@ class Grid:
         Raises:
             InputError: more cells than a table may have.
         """
-        low, extent = np.array(bbox.min).ravel() - 0.5 * edge, np.array(bbox.extents()).ravel() + edge
-        size = np.maximum(np.ceil(extent / edge), 1).astype(int)
-        n_cells = 6 * np.prod(size.astype(float))
+        low, extent = np.array(bbox.min).ravel() - 0.5 * edge, np.array(bbox.extents()).ravel()
+        n_cells = Grid.cells_over(extent, edge)
         if n_cells > MOST_CELLS:
             raise InputError(f"records of this radius need a table of {n_cells:.1g} cells, {4e-9 * n_cells:.2g} GB: "
                              f"at most {MOST_CELLS:.1g}; make record_radius larger")
         headroom.require(2 * 4 * n_cells, f"the tables of a cache of {n_cells:.1g} cells", "make record_radius larger")
+        size = Grid._voxels(extent, edge).astype(int)
         opaque = [dr.opaque(mi.Float, float(x)) for x in low], [dr.opaque(mi.UInt32, int(x)) for x in size]
         return Grid(mi.Point3f(opaque[0]), dr.opaque(mi.Float, 1 / edge), mi.Vector3u(opaque[1]), 6 * int(np.prod(size)))
 
+    @staticmethod
+    def _voxels(extent: np.ndarray, edge: float) -> np.ndarray:
+        """Along each axis [3]; as floats, which do not overflow."""
+        return np.maximum(np.ceil((extent + edge) / edge), 1).astype(float)
+
+    @staticmethod
+    def cells_over(extent: np.ndarray, edge: float) -> float:
+        """Number of cells over a box of an extent [3, scene units] with voxels of `edge` scene units."""
+        return 6 * float(np.prod(Grid._voxels(extent, edge)))
+
+    def covers(self, p: mi.Point3f) -> mi.Bool:
+        """Whether a point lies in one of the voxels."""
+        x = mi.Vector3i(dr.floor((p - self.origin) * self.inverse_edge))
+        return dr.all((x >= 0) & (x < mi.Vector3i(self.size)))
+
     def coordinates(self, p: mi.Point3f, level: int = 0) -> mi.Vector3u:
-        """Voxel of a point, of edges halved `level` times; points outside the box go to its border."""
+        """Voxel of a point, of edges halved `level` times; points that no voxel covers go to the border."""
         x = mi.Vector3i(dr.floor((p - self.origin) * self.inverse_edge * 2 ** level))
         return mi.Vector3u(dr.clip(x, 0, (mi.Vector3i(self.size) << level) - 1))
 
@@ -137,13 +152,15 @@ class RecordCache:
     """Records and the table that finds them; the same class holds radiance and importance records.
 
     Args:
-        bbox: the scene's bounding box.
-        record_radius: largest validity radius r_max, with which records begin, in units of the box's diagonal.
+        bbox: the box that the table covers; no record is added outside of it.
+        record_radius: largest validity radius r_max, with which records begin, as a share of the scale.
+        scale: that of what records must resolve [scene units], see `SeenExtent`; None: the diagonal of the box.
     """
 
-    def __init__(self, bbox: mi.ScalarBoundingBox3f, record_radius: float) -> None:
+    def __init__(self, bbox: mi.ScalarBoundingBox3f, record_radius: float, scale: float | None = None) -> None:
         self.bbox, self.record_radius = bbox, record_radius
-        self.radius = record_radius * float(dr.norm(bbox.extents()))         # r_max [scene units]
+        self.scale = float(dr.norm(bbox.extents())) if scale is None else scale
+        self.radius = record_radius * self.scale                    # r_max [scene units]
         if not SMALLEST_RADIUS < self.radius < 1 / SMALLEST_RADIUS:
             raise InputError(f"records of radius {self.radius:.2g}: scenes must be of a size whose square float32 can hold")
         self.grid = Grid.over(bbox, CELL * self.radius)
@@ -195,7 +212,8 @@ class RecordCache:
     # ---------------------- Growth ----------------------
 
     def grow(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> int:
-        """Add records for the points that have none; returns how many.  Existing records keep their index."""
+        """Add records for the points in the box that have none; returns how many.  Existing records keep their index."""
+        active = active & self.grid.covers(p)
         before, few = len(self), max(LEAST, dr.width(p) // RARE)
         for i in range(LEVELS + 1):             # a cell may have to be split, and its child, and so on
             new = dr.compress(self._is_new(p, n, active))
@@ -338,7 +356,8 @@ class RecordCache:
         table = self.table.numpy()
         used = np.flatnonzero(table != MISSING).astype(np.uint32)
         return {"bbox": np.array([np.array(self.bbox.min).ravel(), np.array(self.bbox.max).ravel()]),
-                "record_radius": np.array(self.record_radius), "points": self.points, "radii": self.radii,
+                "record_radius": np.array(self.record_radius), "scale": np.array(self.scale),
+                "points": self.points, "radii": self.radii,
                 "table_size": np.array(len(table)), "table_used": used, "table_entries": table[used],
                 **{f"cells_{name}": field for name, field in vars(self.cells).items()}}
 
@@ -353,7 +372,9 @@ class RecordCache:
         npz.require(np.isfinite(bounds).all() and (bounds[0] <= bounds[1]).all() and (bounds[0] < bounds[1]).any(), "bbox")
         npz.require(0 < record_radius <= 0.25, "record_radius")
         bbox = mi.ScalarBoundingBox3f(*(mi.ScalarPoint3f(*map(float, corner)) for corner in bounds))
-        cache = RecordCache(bbox, record_radius)
+        scale = float(arrays["scale"]) if "scale" in arrays else None       # older files have none
+        npz.require(scale is None or 0 < scale < np.inf, "scale")
+        cache = RecordCache(bbox, record_radius, scale)
         n, m = len(arrays["points"]), len(arrays["cells_slot"])
         cache.points = npz.checked(arrays, "points", np.float32, n, 6)
         cache.radii = npz.checked(arrays, "radii", np.float32, n)

@@ -47,6 +47,7 @@ ENOUGH = 100_000                    # importons of a pass that are learnt from
 MOST = 2000                         # of these a record takes
 CLAMP = 100                         # heavier importons count as this many times the pass's mean weight
 INNER = 0.99                        # of the importance leaves through the guided disk
+SMALLEST = 1e-5                     # radius of the guided disk / of the scene: of a smaller one float32 can't tell the points
 OUTSIDE = 0.1                       # of that of a later pass beside it, from which on there is a new one
 
 
@@ -197,7 +198,7 @@ class EmissionGuide:
         last = min(int(np.searchsorted(np.cumsum(weight[order]), INNER)), len(order) - 1)
         radius = 1.05 * distance[order[last]]
         self.guided_center = mi.Point3f([dr.opaque(mi.Float, x) for x in center])
-        self.guided_radius = dr.opaque(mi.Float, float(np.clip(radius, 1e-3 * self.radius, self.radius)))
+        self.guided_radius = dr.opaque(mi.Float, float(np.clip(radius, SMALLEST * self.radius, self.radius)))
 
     def _add_records(self, keys: np.ndarray, seed: int) -> None:
         new = keys[self.records[keys] == MISSING]

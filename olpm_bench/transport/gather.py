@@ -1,9 +1,11 @@
 """Bring particles to the records that learn from them.
 
-Two ways, both deterministic:
+Three ways, all deterministic:
 
 * `binned`: a particle goes to the record that its own look-up finds; of more than `neighbours`, evenly spaced ones
   are kept and stand for the others.  One sort, O(1) a particle.
+* `pooled`: so, too, but a record with fewer than `neighbours` also learns from the particles of the records around it.  Many
+  camera paths meet no light, and small records would each learn from hardly any.
 * `nearest`: each record takes exactly the `neighbours` nearest particles within r_max, as in the paper [L], however small
   its validity radius.
   Exact to a 2^-24 part of the squared radius; equals are taken in a fixed order.
@@ -18,7 +20,7 @@ import numpy as np
 from scipy import ndimage
 
 from olpm_bench.transport import headroom
-from olpm_bench.transport.cache import MOST_CELLS, Grid, RecordCache
+from olpm_bench.transport.cache import MOST_CELLS, Grid, RecordCache, nearest_points
 from olpm_bench.transport.particles import Particles
 from olpm_bench.transport.settings import InputError
 from representations.interface import ParticleBatch, group, offsets
@@ -30,6 +32,8 @@ DIGIT_BITS, DIGITS = 8, 3   # of the squared distances, for selection by radix
 FARTHEST = 2 ** (DIGIT_BITS * DIGITS) - 1       # the largest of them, just within r_max
 FINEST = 4                  # times that the edge of voxels is halved for records among many particles
 FLAT = 0.35                 # of the particles of 27 voxels, those of a plane within one edge: pi / 9
+LENDERS = 9                 # records that one learns from, itself included, ...
+FARTHEST_LENDER = 4.0       # ... and their distance / r_max, at most
 AMPLE = 2.0                 # expected particles within an edge / those that a record takes
 
 
@@ -68,6 +72,60 @@ def binned(cache: RecordCache, particles: Particles, neighbours: int, parallax: 
     reach = cache.row(i)[3]
     extent = reach * dr.sqrt(wanted / mi.Float(found))
     return _batch(cache, particles, place, dr.gather(mi.UInt32, record, chosen), stands_for, extent, reach, parallax)
+
+
+def pooled(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
+    """The particles that fall to each record; where these are fewer than `neighbours`, also those of records around it.
+
+    The bandwidth follows the density of particles, as that of the k nearest does: where records are small and particles are
+    few, each record would learn from hardly any.  Records lend in the order of their distance until there are enough.
+    """
+    if len(particles) == 0:
+        return _nothing(cache)
+    p, weight, _, _, n = particles.read(particles.place)
+    record, _, valid = cache.lookup(p, n, weight > 0)
+    order, _, offset = group(dr.select(valid, record, dr.opaque(mi.UInt32, len(cache))), len(cache))
+    if len(order) == 0:
+        return _nothing(cache)
+    first = offset.numpy().astype(np.int64)
+    found = np.diff(first)
+    borrower, lender = _lenders(cache, found, neighbours)
+    # One entry for each particle of each lender, grouped by borrower
+    lent = found[lender]
+    entry = np.arange(lent.sum()) + np.repeat(first[lender] - (np.cumsum(lent) - lent), lent)
+    by = np.repeat(borrower, lent)
+    have = np.bincount(by, minlength=len(cache))
+    rank = np.arange(len(by)) - np.repeat(np.cumsum(have) - have, have)
+    kept = np.minimum(have, neighbours)
+    chosen = rank * kept[by] % np.maximum(have[by], 1) < kept[by]           # evenly spaced ones
+    entry, by = entry[chosen], by[chosen]
+    place = dr.gather(mi.UInt32, particles.place, dr.gather(mi.UInt32, order, copied(mi.UInt32, entry.astype(np.uint32))))
+    record = copied(mi.UInt32, by.astype(np.uint32))
+    stands_for = copied(mi.Float, (have / np.maximum(kept, 1))[by].astype(np.float32))
+    # Directions below the horizon of the borrower teach it nothing
+    _, normal, _, _ = cache.row(record)
+    _, _, d, _, _ = particles.read(place)
+    above = dr.compress(dr.dot(d, normal) >= MIN_ELEVATION)
+    if len(above) == 0:
+        return _nothing(cache)
+    place, record, stands_for = (dr.gather(type(x), x, above) for x in (place, record, stands_for))
+    reach = cache.row(dr.arange(mi.UInt32, len(cache)))[3]
+    return _batch(cache, particles, place, record, stands_for, reach, reach, parallax)
+
+
+def _lenders(cache: RecordCache, found: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of records, of which the first learns from the particles of the second; ordered by the first, then by distance.
+
+    Args:
+        found: particles of each record [n_records].
+        neighbours: so many are enough.
+    """
+    k = min(LENDERS, len(cache))
+    index, distance, cosine = nearest_points(cache.points, cache.points, k, cache.radius)
+    lent = found[index] * ((cosine >= MIN_COSINE) & (distance <= FARTHEST_LENDER * cache.radius))
+    before = np.cumsum(lent, axis=1) - lent
+    used = (lent > 0) & (before < neighbours)
+    return np.nonzero(used)[0], index[used]
 
 
 def nearest(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
@@ -169,7 +227,8 @@ class _Candidates:
         p, weight, d, _, n = particles.read(particles.place)
         grid = Grid.over(cache.bbox, cache.radius / 2 ** level)
         n_voxels = grid.n_cells // 6
-        order, _, self.offset = group(dr.select(weight > 0, grid.voxel(p), dr.opaque(mi.UInt32, n_voxels)), n_voxels)
+        used = (weight > 0) & grid.covers(p)
+        order, _, self.offset = group(dr.select(used, grid.voxel(p), dr.opaque(mi.UInt32, n_voxels)), n_voxels)
         self.hit = order
         self.p, self.d, self.n = (dr.gather(type(v), v, order) for v in (p, d, n))
         self.grid, self.record, self.n_records = grid, record, len(record)

@@ -81,9 +81,11 @@ class TrainingSettings:
     blend: let the images of camera passes of the second half of training into the result, sample for sample.
     while_rendering: go on learning from the paths of every rendering pass.
     gather: "binned": the particles whose look-up gives the record, at most `neighbours` of them;
-        "nearest": exactly the `neighbours` nearest within the record radius, as in the paper.  (Camera paths are binned.)
+        "nearest": exactly the `neighbours` nearest within the record radius, as in the paper.  (Camera paths are binned, too, and
+        records with fewer than `neighbours` vertices also learn from those around them.)
     neighbours: particles of a pass used by a record, at most [L: 250].
-    record_radius: largest validity radius of a record, in units of the scene's diagonal [L: 0.01].
+    record_radius: largest validity radius of a record, as a share of the diagonal of what the camera and its paths see, which
+        is at most ten times as long as their median segment (`transport.seen_extent`) [L: 0.01, of the scene's diagonal].
     shrink: records shrink from there, to a tenth at most, where particles are dense, sources near or lobes sharp, as in the
         paper; off by default: at equal time it costs more than it gains.
     inherit: new records begin with what those beside them have learnt.
@@ -135,7 +137,8 @@ class TrainingSettings:
             _require(1 <= getattr(self, name) <= MOST, name, getattr(self, name), f">= 1, at most {MOST}")
         number = isinstance(self.share, int | float) and not isinstance(self.share, bool)
         _require(self.share == "auto" or (number and 0 < self.share <= 1), "share", self.share, "in (0, 1], or 'auto'")
-        _require(0 < self.record_radius <= 0.25, "record_radius", self.record_radius, "in (0, 0.25] of the scene's diagonal")
+        _require(0 < self.record_radius <= 0.25, "record_radius", self.record_radius,
+                 "in (0, 0.25] of the diagonal of what the camera's paths see")
         _require(0 < self.fraction <= 1, "fraction", self.fraction, "in (0, 1]")
         _require(0 < self.emission_fraction <= 1, "emission_fraction", self.emission_fraction, "in (0, 1]")
 

@@ -27,11 +27,12 @@ from olpm_bench.transport.bounds import surface_bounds
 from olpm_bench.transport.cache import RecordCache
 from olpm_bench.transport.camera_paths import CameraPaths
 from olpm_bench.transport.emission import EmissionGuide, distant_lights
-from olpm_bench.transport.gather import GATHERS, Gathered, binned, by_record
+from olpm_bench.transport.gather import GATHERS, Gathered, by_record, pooled
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.particles import ParticleRays, Particles, emit_importons, emit_photons, trace
 from olpm_bench.transport.roulette import PixelEstimate
 from olpm_bench.transport.scene_checks import Fingerprint, require_valid_box
+from olpm_bench.transport.seen_extent import SeenExtent
 from olpm_bench.transport.settings import InputError, IntegratorSettings, TrainingSettings
 from olpm_bench.transport.usable import require_usable
 from olpm_bench.transport.view import records_seen
@@ -136,20 +137,20 @@ class Training:
         check_traceable(scene)
         self.scene, self.settings, self.max_depth, self.seed = scene, settings, integrator.max_depth, seed
         specification = {"type": representation} if isinstance(representation, str) else dict(representation)
+        self.sensor = sensor or scene.sensors()[0]
         self.bounds = bounds = surface_bounds(scene)
-        self.radiance = Guide(RecordCache(bounds, settings.record_radius), specification,
-                              integrator.fraction if settings.learn_fraction else None, settings.parallax,
-                              settings.learn_direct, settings.inherit)
+        self.seen = SeenExtent.of(scene, self.sensor, self.max_depth, bounds, settings.record_radius)
+        cache = partial(RecordCache, self.seen.covered, settings.record_radius, self.seen.scale)
+        self.radiance = Guide(cache(), specification, integrator.fraction if settings.learn_fraction else None,
+                              settings.parallax, settings.learn_direct, settings.inherit)
         self.radiance.scene = Fingerprint.of(scene)
-        self.importance = Guide(RecordCache(bounds, settings.record_radius), specification, parallax=settings.parallax,
-                                inherit=settings.inherit)
+        self.importance = Guide(cache(), specification, parallax=settings.parallax, inherit=settings.inherit)
         self.integrator = GuidedPathIntegrator(integrator, self.radiance)
         self.luminance: np.ndarray | None = None        # of the mean of all camera passes so far (h, w), ...
         self.spp = 0                                    # ... and their samples a pixel
         self.emission = EmissionGuide(scene, bounds, settings.emission_fraction) if (
             settings.emission == "guided" and settings.schedule != "single_batch" and distant_lights(scene)) else None
         self.regions = regions
-        self.sensor = sensor or scene.sensors()[0]
         film = self.sensor.film()
         self.pixels = int(np.prod(film.crop_size() + 2 * film.rfilter().border_size() * film.sample_border()))
         self.camera_spp = 1 << max(0, round(np.log2(settings.camera_paths / self.pixels)))      # of a camera pass
@@ -165,7 +166,8 @@ class Training:
     def run(self) -> Iterator[PassStatistics]:
         """Train as the settings say, one pass at each step.  Who stops early has a guide as good as the passes done."""
         for index, step in enumerate(step for step, times in self.steps for _ in range(times)):
-            yield step(PassStatistics(index, self.passes, warnings=self._out_of_scale() if index == 0 else []))
+            said = [*self._out_of_scale(), *self.seen.warnings(self.radiance.cache.radius)] if index == 0 else []
+            yield step(PassStatistics(index, self.passes, warnings=said))
 
     def _out_of_scale(self) -> list[str]:
         """What to tell of a scene that is too far from the origin for single precision."""
@@ -273,9 +275,15 @@ class Training:
             p, weight, _, _, n = particles.read(particles.place)
             if self.settings.shrink:
                 guide.shrink()
-            self._grow(guide, p, n, weight > 0, statistics)
+            self._grow(guide, p, n, (weight > 0) & self._of_use(guide, p, n), statistics)
         with _Seconds(statistics, "gather"):
             return GATHERS[self.settings.gather](guide.cache, particles, neighbours, self.settings.parallax)
+
+    def _of_use(self, guide: Guide, p: mi.Point3f, n: mi.Normal3f) -> mi.Bool:
+        """Where particles may add records to a guide: photons, outside the seen box, only where importons have been."""
+        if guide is self.importance or not self.importance.records:
+            return mi.Bool(True)
+        return self.seen.contains(p) | self.importance.cache.lookup(p, n, mi.Bool(True))[2]
 
     def _grow(self, guide: Guide, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, statistics: PassStatistics) -> None:
         guide.grow(p, n, active, self._next_seed())
@@ -300,7 +308,7 @@ class Training:
             with _Seconds(statistics, "gather"):
                 batch = ParticleBatch.empty(guide.records)
                 if self.settings.learn_radiance:
-                    batch = binned(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
+                    batch = pooled(guide.cache, paths.lessons(vertices.place), self.settings.neighbours, self.settings.parallax)
                 place, offset = by_record(guide.cache, vertices)
             if len(place):          # a record serves some of them
                 with _Seconds(statistics, "update"):

@@ -9,7 +9,7 @@ from small_scenes import box, grey
 
 from olpm_bench.transport import gather
 from olpm_bench.transport.cache import RecordCache
-from olpm_bench.transport.gather import MIN_COSINE, MIN_ELEVATION, binned, nearest
+from olpm_bench.transport.gather import FARTHEST_LENDER, LENDERS, MIN_COSINE, MIN_ELEVATION, binned, nearest, pooled
 from olpm_bench.transport.particles import emit_photons, trace
 from olpm_bench.transport.training import surface_bounds
 
@@ -69,7 +69,34 @@ def test_binned_are_those_that_look_the_record_up(landed):
     assert dr.sum(few.weight)[0] == pytest.approx(total, rel=0.02)
 
 
-@pytest.mark.parametrize("gather", [binned, nearest])
+def test_pooled_records_with_few_particles_learn_from_those_around_them(landed):
+    cache, particles = landed
+    wanted = 600
+    own = binned(cache, particles, 10 ** 6).count().numpy()
+    batch = pooled(cache, particles, wanted, parallax=True)
+    count = batch.count().numpy()
+    assert (own < wanted / 2).mean() > 0.2
+    assert (count <= wanted).all()
+    assert (count >= 0.7 * np.minimum(own, wanted)).all()       # all see the same directions, but for their horizons
+    assert np.mean(count[own < wanted / 2] > wanted / 2) > 0.8
+    assert np.all(np.diff(batch.record.numpy().astype(int)) >= 0)
+    farthest = (FARTHEST_LENDER + 2) * cache.radius             # a lender's own particles lie around it
+    assert np.linalg.norm(batch.at.numpy(), axis=0).max() < farthest
+    assert batch.wo.numpy()[2].min() >= MIN_ELEVATION * 0.99
+
+
+def test_pooled_takes_no_more_than_it_needs(landed):
+    """Records with enough particles of their own keep to these."""
+    cache, particles = landed
+    one = int(np.median(binned(cache, particles, 10 ** 6).count().numpy()))
+    few = max(one // (2 * LENDERS), 1)
+    a, b = pooled(cache, particles, few, parallax=True), binned(cache, particles, few, parallax=True)
+    own = binned(cache, particles, 10 ** 6).count().numpy() >= 2 * few
+    distance = [np.linalg.norm(x.at.numpy(), axis=0)[own[x.record.numpy()]].max() for x in (a, b)]
+    assert distance[0] < 1.2 * distance[1]
+
+
+@pytest.mark.parametrize("gather", [binned, pooled, nearest])
 def test_directions_are_in_the_frame_of_the_record(landed, gather):
     cache, particles = landed
     batch = gather(cache, particles, 250)
@@ -93,7 +120,7 @@ def test_extent_is_the_radius_that_would_hold_the_neighbours(landed):
                                cache.radius * np.minimum(np.sqrt(100 / np.maximum(found, 1)), 1), rtol=1e-4)
 
 
-@pytest.mark.parametrize("gather", [binned, nearest])
+@pytest.mark.parametrize("gather", [binned, pooled, nearest])
 def test_same_particles_same_batch(landed, gather):
     cache, particles = landed
     a, b = (gather(cache, particles, 100) for _ in range(2))
