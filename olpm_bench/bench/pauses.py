@@ -41,9 +41,10 @@ class Pauses:
 
     def watch(self) -> None:
         """Beat for as long as the process lives."""
+        never = threading.Event()
+
         def beat() -> None:
-            while True:
-                time.sleep(INTERVAL)
+            while not never.wait(INTERVAL):
                 self.seconds()
         threading.Thread(target=beat, name="pauses", daemon=True).start()
 

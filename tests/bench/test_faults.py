@@ -526,13 +526,13 @@ def test_a_torn_pass_never_enters_a_reference(monkeypatch):
         Interrupting.left = 0
         pixels = np.full((2, 3, 3), 3.0).view(Interrupting)
         Interrupting.left = left
-        before = (accumulator.mean.copy(), accumulator.m2.copy(), accumulator.spp, accumulator.passes)
+        before = (accumulator.mean.copy(), accumulator.square_m2.copy(), accumulator.spp, accumulator.passes)
         try:
             accumulator.add(pixels, 4)
         except KeyboardInterrupt:
             interrupted += 1
             assert (accumulator.spp, accumulator.passes) == before[2:]
-            assert np.array_equal(accumulator.mean, before[0]) and np.array_equal(accumulator.m2, before[1])
+            assert np.array_equal(accumulator.mean, before[0]) and np.array_equal(accumulator.square_m2, before[1])
         else:
             break
     assert interrupted > 2

@@ -41,7 +41,8 @@ def made(tmp_path, reference: str | None = None, passes: tuple[int, ...] = (1, 4
         trained = [{"photons": 1000 * asked, "stored": 10_000 * asked}] if name == "Stored" else (
             [{"photons": 1000, "stored": 10_000}] * min(asked, most))
         info = {"key": cell.key, "records": 100 if asked else 0, "bytes_per_record": 200, "charged_seconds": 1.0,
-                "train_seconds": 0.5 * asked, "passes": trained, "mean": 1.0, "mean_stderr": 0.1}
+                "train_seconds": 0.5 * asked, "passes": trained, "mean": 1.0, "mean_stderr": 0.1,
+                "wait_fraction": 0.0}
         results.write_cell(cell.scene.name, cell.method.name, cell.seed, info, [{"seconds": 1.0, "train_seconds": 0, "spp": 16}],
                            {"mean": image, "variance": TRUTH, "count": TRUTH[..., 0]}, [image])
     results.write_json("env.json", {"schema_version": 1, "cpu": "Abacus 2", "threads": 2})
