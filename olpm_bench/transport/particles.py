@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from olpm_bench.transport import adjoint
 from olpm_bench.transport.camera_rays import sample_ray
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.guided_bsdf import GuidedBSDF, incident_normal
@@ -170,7 +171,8 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         sampler: as wide as the rays.
         guide: the distributions that guide scattering: importance for photons, radiance for importons.
         max_depth: longest camera path; a particle's path joins a camera path by one segment at least.
-        mode: `Importance` for photons (which then correct for shading normals), `Radiance` for importons.
+        mode: `Importance` for photons (whose weights are then those of :mod:`~olpm_bench.transport.adjoint`), `Radiance` for
+            importons.
         window: what to keep alike; None keeps the weights in the wide window of [L].
         emission: also keep how importons reach its lights, from the second vertex on: those that scatter there, and next-event
             estimates, without which none would find a directional light and few the sun (balance heuristic).
@@ -273,15 +275,12 @@ def trace(scene: mi.Scene, rays: ParticleRays, sampler: mi.Sampler, guide: Guide
         # ---------------------- Scatter ----------------------
         scatter = hit & (~light | survives) & (depth < last)
         bs, bsdf_weight = bsdf.sample(ctx, sampler.next_1d(scatter), sampler.next_2d(scatter), scatter)
-        d = si.to_world(bs.wo)
-        weight *= bsdf_weight
         if dr.hint(photons, mode="scalar"):
-            # Shading normals make the BSDF asymmetric (Veach 1997, eq. 5.19); no light leaks through the surface.
-            wi_n, wo_n = dr.dot(si.n, -ray.d), dr.dot(si.n, d)
-            cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
-            same_side = (wi_n * cos_i > 0) & (wo_n * cos_o > 0)
-            weight *= dr.select(same_side, dr.abs(cos_i * wo_n / (cos_o * wi_n)), 0)
-        broken = scatter & ~(usable(weight) & dr.all(dr.isfinite(d)))
+            bsdf_weight = adjoint.sample_weight(bsdf.bsdf, si, bs, bsdf_weight, scatter)
+        d = si.to_world(bs.wo)
+        # A sample without a direction has failed, as one of weight 0; `blendbsdf` seen from behind gives NaN for both.
+        weight = dr.select(dr.all(dr.isfinite(d)), weight * bsdf_weight, 0)
+        broken = scatter & ~usable(weight)
         unusable[broken] += 1
         alive = scatter & ~broken & (dr.max(weight) > 0)
         if dr.hint(emission is not None, mode="scalar"):
