@@ -279,9 +279,11 @@ def test_an_invalid_pixel_is_found_and_named(value):
         cell.check_pixels(image, "pass 7")
 
 
-def test_an_invalid_pixel_fails_a_cell_even_if_it_only_trains(experiment, monkeypatch):
+@pytest.mark.parametrize("enters", [True, False])
+def test_an_invalid_pixel_of_a_training_image_fails_a_cell_whose_result_it_enters(experiment, monkeypatch, enters):
     text = TOML + 'representation = { type = "cosine" }\n'
-    experiment.path.write_text(text + "training = { passes = 0, camera_passes = 1, camera_paths = 200, blend = false }\n")
+    training = f"passes = 0, camera_passes = 2, camera_paths = 200, blend = {str(enters).lower()}"
+    experiment.path.write_text(f"{text}training = {{ {training} }}\n")
     spec, learn = experiment_file.load(experiment.path).cells()[1], cell.Training._camera_pass
 
     def broken(self, statistics):
@@ -290,5 +292,10 @@ def test_an_invalid_pixel_fails_a_cell_even_if_it_only_trains(experiment, monkey
         return done
 
     monkeypatch.setattr(cell.Training, "_camera_pass", broken)
-    with pytest.raises(CellFailedError, match="in training pass 1"):
-        cell.measure(spec, cell.load_scene(spec), WarmUp(0.0, 1.0))
+    scene, warm = cell.load_scene(spec), WarmUp(0.0, 1.0)
+    if enters:          # that of the second half
+        with pytest.raises(CellFailedError, match="in training pass 2"):
+            cell.measure(spec, scene, warm)
+    else:
+        done = cell.measure(spec, scene, warm)
+        assert done.info["training_passes"] == 2 and np.isfinite(done.image["mean"]).all()
