@@ -81,7 +81,7 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
     def teach(batches: list[list[Particles]]) -> Any:
         state = representation.init(len(owner), seed, parallax)
         for index, given in enumerate(batches):
-            state = representation.update(state, batch(given, parallax, far=True), seed + index)
+            state = representation.update(state, batch(given, parallax, far=parallax), seed + index)
             dr.eval(state)
         return state
 

@@ -10,7 +10,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from olpm_bench.check import examination, suite
-from olpm_bench.check.particles import CONDITIONS, LATE, LONG, many, nothing, uniform_directions
+from olpm_bench.check.particles import BATCHES, CONDITIONS, IDENTICAL, LONG, many, nothing, uniform_directions
 from olpm_bench.check.picture import CELL, over_disk
 from olpm_bench.check.population import ASKED, population, population_with_parallax
 from olpm_bench.check.proposal import Proposals
@@ -69,7 +69,7 @@ def test_proposals_have_their_density() -> None:
 
 def test_every_condition_is_in_both_populations() -> None:
     records = population(0)
-    assert set(records.conditions) == {*CONDITIONS, *LONG} and len(records.batches) == LATE
+    assert set(records.conditions) == {*CONDITIONS, *LONG} and len(records.batches) == BATCHES
     assert max(len(records.of(r)[1]) for r in range(len(records))) > 1_000_000
     empty = [r for r in range(len(records)) if len(records.of(r)[1]) == 0]
     assert empty and all(records.conditions[r] in ("untrained", "few at a time") for r in empty)
@@ -77,6 +77,11 @@ def test_every_condition_is_in_both_populations() -> None:
     aimed = population_with_parallax(0)
     everywhere = {f"{name}, {asked}" for name in CONDITIONS for asked in ASKED}
     assert set(aimed.conditions) == everywhere | {f"{name}, {next(iter(ASKED))}" for name in LONG}
+    thousands = records.conditions.index("thousands identical")
+    assert len(records.of(thousands)[1]) == IDENTICAL and records.proposals.count[thousands] == 1
+    assert all(batch.at is not None for batch in aimed.arrays() if len(batch))
+    finite = [np.isfinite(batch.distance).mean() for batch in records.arrays()]
+    assert all(batch.at is None for batch in records.arrays()) and min(finite) > 0.5        # as in training
     identical = aimed.conditions.index("ten identical, beside")
     assert len(aimed.of(identical)[1]) == 10 and aimed.proposals.count[identical] == 1 and aimed.complete[identical]
 
