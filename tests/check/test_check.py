@@ -145,6 +145,21 @@ def test_a_declaration_is_believed_only_if_it_is_true() -> None:
     assert call(f"{MUTANTS}:MemoryGrows", "--only", "memory", "--declare", "grows").exit_code == 0
 
 
+@pytest.mark.parametrize(("name", "setting"), [("hey", "cones=1"), ("hey", "cones=4"), ("jensen", "resolution=2"),
+                                              ("gaussian_mixture", "components=1")])
+def test_what_keeps_little_is_valid_if_it_says_so(name: str, setting: str) -> None:
+    """One cone is a density; it learns one particle of a thousand, and aims at it, and is too wide for more."""
+    command = [name, "--set", f"representation.{setting}", "--only", "learning", "--only", "aiming"]
+    result = call(*command)
+    assert result.exit_code == 1 and "1 of 2 checks FAILED" in result.stdout and "is declared coarse" in result.stdout
+    assert call(*command, "--declare", "coarse").exit_code == 0
+
+
+def test_who_learns_nothing_is_not_coarse() -> None:
+    assert call("jensen", "--set", "representation.resolution=1", "--only", "learning", "--declare", "coarse").exit_code == 1
+    assert call("cosine", "--only", "learning", "--declare", "coarse").exit_code == 1
+
+
 def test_a_campaign_counts_alarms(tmp_path: Path) -> None:
     result = call("jensen", "--only", "learning", "--repeat", 3, "--seed", 5)
     assert result.exit_code == 0 and "0 of 3 runs raised an alarm" in result.stdout and "seed 7: passed" in result.stdout
@@ -242,7 +257,7 @@ def test_a_logged_run_without_its_p_values_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["nosuch"], "unknown representation 'nosuch'"), (["jensen", "--only", "nosuch"], "unknown check 'nosuch'; known: density"),
-    (["jensen", "--declare", "nosuch"], "--declare nosuch: must be one of constant, grows"),
+    (["jensen", "--declare", "nosuch"], "--declare nosuch: must be one of constant, grows, coarse"),
     (["missing.py:Mine"], "there is no such file"), (["jensen", "--set", "representation.bins=3"], "no parameter 'bins'")])
 def test_bad_input(arguments: list[str], words: str) -> None:
     result = call(*arguments)
