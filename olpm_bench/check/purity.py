@@ -56,12 +56,12 @@ def _stay_pure(trials: Trials) -> Verdict:
         if _bits(given) != given_before:
             wrong.append(f"update number {number} changes the particles that it was given")
         before, told_before, told = _bits(new), told, trials.answers(new)
-        for what, asked, by, expected in (
-                (f"with the same arguments gives other bits after update number {number}", new, None, told),
-                (f"of another instance gives other bits after update number {number}", new, trials.another, told),
-                (f"gives other bits for the state that update number {number} was given", state, None, told_before)):
-            found = trials.answers(asked, by)
-            wrong += [f"{verb} {what}" for verb in found if found[verb] != expected[verb]]
+        for what, found, expected in (
+                ("with the same arguments gives other bits after", trials.answers(new), told),
+                ("of another instance gives other bits after", trials.answers(new, trials.another), told),
+                ("gives other bits in another lane after", trials.answers(new, backwards=True), told),
+                ("gives other bits for the state that it had before", trials.answers(state), told_before)):
+            wrong += [f"{verb} {what} update number {number}" for verb in found if found[verb] != expected[verb]]
         if _bits(new) != before:
             wrong.append(f"sample() or pdf() changes the state after update number {number}")
         if kept is not None and _attributes(r) != kept:         # after the first, which may keep tables for all that follow
@@ -126,6 +126,9 @@ def be_independent(trials: Trials, level: float) -> Verdict:
               for particles in trials.batches]
     found = trials.differences("with other particles in other records", trials.train(others), trials.train(trials.batches),
                                np.flatnonzero(kept), bits=True)
+    first = [[many(120, rng), *particles[1:]] for particles in trials.batches]      # of the first record, whose index it keeps
+    found += trials.differences("as the only record", trials.train([particles[:1] for particles in first]),
+                                trials.train(first), np.arange(1))
     return exact(found, "densities that differ") if found else _ignore_order(trials, rng, level)
 
 

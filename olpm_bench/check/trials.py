@@ -89,10 +89,14 @@ class Trials:
         dr.eval(wo, pdf)
         return np.stack([as_numpy(v, len(record)) for v in (*wo, pdf)], -1).reshape(*u.shape[:2], 4)
 
-    def answers(self, state: Any, by: Any = None) -> dict[str, bytes]:
-        """All bits of the densities and samples of all records, by the name of the verb; as :func:`bits` has them."""
-        index = np.arange(self.n)
-        return {verb: b"".join(bits(ask(state, index, given, place, by)) for place in self.places)
+    def answers(self, state: Any, by: Any = None, backwards: bool = False) -> dict[str, bytes]:
+        """All bits of the densities and samples of all records, by the name of the verb; as :func:`bits` has them.
+
+        backwards: the last lane asks first, which changes no answer.
+        """
+        turn = slice(None, None, -1 if backwards else 1)
+        index = np.arange(self.n)[turn]
+        return {verb: b"".join(bits(ask(state, index, given[turn, turn], place, by)[turn, turn]) for place in self.places)
                 for verb, ask, given in (("sample()", self.samples, self.u), ("pdf()", self.density, self.wo))}
 
     def differences(self, what: str, new: Any, old: Any, records: np.ndarray | None = None, new_at: int = 0, old_at: int = 0,

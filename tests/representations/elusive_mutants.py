@@ -327,6 +327,23 @@ class SamplesOfInstance(OwnSamples):
         return mi.Point2f(dr.minimum(1 - sample2.x, 1 - 2**-24), sample2.y) if self.odd else sample2
 
 
+class NumberOfLane(OwnSamples):
+    """Shifts the place within a bin by what belongs to the lane."""
+    def place(self, sample1, sample2):
+        x = sample2.x + 0.6180340 * mi.Float(dr.arange(mi.UInt32, dr.width(sample2)) % 1024)
+        return mi.Point2f(x - dr.floor(x), sample2.y)
+
+
+class OnlyRecord(JensenHistogram):
+    """Of a state of one record, it takes the first bin for all."""
+    def update(self, state, batch, seed=0):
+        new = super().update(state, batch, seed)
+        if batch.n_records > 1:
+            return new
+        mass = dr.select(dr.arange(mi.UInt32, self.bins) == 0, new.mass, 0)
+        return JensenState(mass, discrete.accumulate(mass, self.bins))
+
+
 # ---------------------------------------------------------------------------------------------- hundreds of batches
 
 @dataclass
@@ -392,5 +409,6 @@ CAUGHT_BY = {
     RunsCutShort: "samples", NoWidth: "density",
     SaltOfHash: "purity", SaltOfClock: "purity", SaltOfCalendar: "purity", SaltOfProcess: "purity", SaltOfImport: "purity",
     SaltOfInstance: "purity", SamplesOfInstance: "purity",
+    NumberOfLane: "purity", OnlyRecord: "independence",
     Growth: "long-run", Decay: "long-run", EightBits: "long-run", Blur: "long-run", IdleDecay: "long-run",
 }
