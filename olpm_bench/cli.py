@@ -442,8 +442,8 @@ def fit(representation: Annotated[str, typer.Option(metavar="NAME", show_default
 @command
 def check(representation: Annotated[str, typer.Argument(metavar="NAME|FILE.py:CLASS", show_default=False)],
           set_: Assignments = [],  # noqa: B006
-          declare: Annotated[list[str], typer.Option(metavar="constant|grows", help="On purpose, it learns nothing, or keeps all "
-                                                     "particles.")] = [],  # noqa: B006
+          declare: Annotated[list[str], typer.Option(metavar="constant|grows|coarse", help="On purpose, it learns nothing, keeps "
+                                                     "all particles, or keeps too little to fit several lobes.")] = [],  # noqa: B006
           only: Annotated[list[str], typer.Option(metavar="CHECK", help="Leave out all other checks.")] = [],  # noqa: B006
           seed: Annotated[int, typer.Option(min=0, max=1 << 24)] = 0,
           repeat: Annotated[int, typer.Option(min=1, help="Run with so many seeds, and count the false alarms.")] = 1,

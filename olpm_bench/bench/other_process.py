@@ -10,7 +10,7 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,12 @@ class Process:
         command: of the process; it reads lines of JSON and answers each by one, as `serve` does.
         seconds: after which a silent one is killed.
         quiet: its standard error goes nowhere.
+        environment: variables that it has besides those of this process, or in place of them.
     """
 
-    def __init__(self, command: Sequence[str], seconds: float = SECONDS, quiet: bool = True) -> None:
-        self.command, self.seconds, self.starts = list(command), seconds, 0
+    def __init__(self, command: Sequence[str], seconds: float = SECONDS, quiet: bool = True,
+                 environment: Mapping[str, str] | None = None) -> None:
+        self.command, self.seconds, self.starts, self.environment = list(command), seconds, 0, environment or {}
         self.stderr = subprocess.DEVNULL if quiet else None
         self.process: subprocess.Popen[bytes] | None = None
 
@@ -50,7 +52,7 @@ class Process:
         """Its answer; {"died": exit code} or {"hung": seconds} without one."""
         if self.process is None:
             folders = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH")]
-            environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, folders))}
+            environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, folders)), **self.environment}
             self.process = subprocess.Popen(self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                                             stderr=self.stderr, env=environment)
             self.starts += 1

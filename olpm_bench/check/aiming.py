@@ -15,9 +15,10 @@ from representations.interface import ParticleBatch
 
 RECORDS, PARTICLES, HELD_OUT = 64, 400, 200     # HELD_OUT: directions of each record
 DISTANCE = 1.0, 2.0         # of the light from the record [scene units]
-SIZE, PLACES = 0.03, 0.05   # deviations of points of the light, and of those on the surface [scene units]
+SIZE, PLACES = 0.03, 0.1   # deviations of points of the light, and of those on the surface [scene units]
 LITTLE = 0.1                # of the cosine in q, as a path tracer has some
-LEAST = 0.02                # nats to be gained by asking from the right place
+LEAST = 0.02                # nats to be gained by asking from the right place, over asking from its mirror image
+SHARE = 0.01                # of that gain, at least, over asking from the record: a quarter for Gaussians, less for wide cones
 SLACK = 0.05                # nats that may be lost by learning from several places
 
 
@@ -58,7 +59,8 @@ def aim(representation: Any, seed: int) -> Verdict:
     if here == record_only == mirrored:
         return Verdict(True, "does not mind where it is asked", None, None)
     at_record = likelihood(teach(np.zeros_like(landed)), beside)
-    margin = min(here - max(record_only, mirrored) - LEAST, here - at_record + SLACK)
+    gain = here - mirrored
+    margin = min(gain - LEAST, here - record_only - SHARE * gain, here - at_record + SLACK)
     words = (f"mean ln q of directions to light nearby: {here:.3f} asked from there, {record_only:.3f} from the record, "
              f"{mirrored:.3f} from its other side; {at_record:.3f} if learnt as seen from the record")
     return Verdict(margin >= 0, "gain, over the least [nats]", margin, 0.0, words, note=words,

@@ -57,6 +57,7 @@ def integral(trained: Trained, level: float) -> Verdict:
     for record in range(n):
         add(records.name(record), [record], record)
     complete = np.flatnonzero(records.complete).tolist()
-    add("all records", complete, max(complete, key=lambda r: abs(first[r] - alive[r])))
+    if complete:
+        add("all records", complete, max(complete, key=lambda r: abs(first[r] - alive[r])))
     note = f"{first.mean():.4f} +- {np.sqrt(variance.sum()) / n:.4f} by quadrature; {alive.mean():.4f} of the samples don't fail"
     return p_values.verdict(level, note)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from olpm_bench.check.many_records import records_that_fit
-from olpm_bench.check.particles import uniform_directions, vector
+from olpm_bench.check.particles import distances, uniform_directions, vector
 from olpm_bench.check.samples import FEWEST, chi_square, of_sums
 from olpm_bench.check.trained import as_numpy
 from olpm_bench.check.verdict import Panel, PValues, Verdict
@@ -36,7 +36,7 @@ def keep_balance(representation: Any, seed: int, level: float) -> Verdict:
     n = records_that_fit(representation, RECORDS)
     particles = uniform_directions(n, rng)
     axes, weight = vector(particles), mi.Float(rng.lognormal(size=n).astype(np.float32))
-    batch = ParticleBatch.from_arrays(axes, weight, dr.arange(mi.UInt32, n), n)
+    batch = ParticleBatch.from_arrays(axes, weight, dr.arange(mi.UInt32, n), n, mi.Float(distances(n, rng)))
     state = representation.update(representation.init(n, seed), batch, seed)
     dr.eval(state)
 

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -53,20 +53,22 @@ DENSITIES = {
 HARD = [name for name in DENSITIES if name != "wide"]       # that a cosine does not fit anyway
 
 
-def learn(representation: Any, seed: int, constant: bool, level: float) -> Verdict:
-    """As `learn_known`, without and with parallax, of light that is infinitely far."""
-    return worst_of({"with parallax" if parallax else "": learn_known(representation, seed, constant, parallax, sidak(level, 2))
+def learn(representation: Any, seed: int, declared: Sequence[str], level: float) -> Verdict:
+    """As `learn_known`, without parallax, and with it of light that is infinitely far."""
+    return worst_of({"with parallax" if parallax else "": learn_known(representation, seed, declared, parallax, sidak(level, 2))
                      for parallax in (False, True)})
 
 
-def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, level: float) -> Verdict:
+def learn_known(representation: Any, seed: int, declared: Sequence[str], parallax: bool, level: float) -> Verdict:
     """Mean ln q of held-out directions, q = (cos / pi + pdf) / 2 as a path tracer uses it, rises with the number of particles.
 
     All of them count: directions of the left half of a density, then of the right half, in one batch or in many, teach more than
     either half.  So do their weights: of particles and more, but lighter uniform decoys, the density is half of either, and the
     weights teach that, not their square roots or squares, nor their products with the cosine, which they contain already.
 
-    `constant`: declared to learn nothing.
+    Declared `constant`, it must learn nothing.  Declared `coarse`, because what it keeps, such as a single cone,
+    fits no known density better than a cosine does, it must only tell them apart: held-out directions are more
+    likely after particles of their own density than after those of another one.
     """
     rng = np.random.default_rng([12, seed])
     owner = [name for name in DENSITIES for _ in range(REPLICATES)]
@@ -81,13 +83,13 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
     def teach(batches: list[list[Particles]]) -> Any:
         state = representation.init(len(owner), seed, parallax)
         for index, given in enumerate(batches):
-            state = representation.update(state, batch(given, parallax, far=True), seed + index)
+            state = representation.update(state, batch(given, parallax, far=parallax), seed + index)
             dr.eval(state)
         return state
 
-    def likelihood(state: Any, wo: np.ndarray, cosine: float) -> np.ndarray:
+    def likelihood(state: Any, wo: np.ndarray, cosine: float, asked: mi.UInt32 = record) -> np.ndarray:
         """Of q with so much of the cosine in it [densities, REPLICATES]."""
-        pdf = as_numpy(representation.pdf(state, record, vector(wo), True, at), len(wo))
+        pdf = as_numpy(representation.pdf(state, asked, vector(wo), True, at), len(wo))
         q = cosine * wo[:, 2] / np.pi + (1 - cosine) * pdf
         return np.log(q).reshape(len(DENSITIES), REPLICATES, HELD_OUT).mean(-1)
 
@@ -109,7 +111,7 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
         "their square roots": lambda weight, wo: weight**0.5, "their squares": lambda weight, wo: weight**2,
         "weights times cosine": lambda weight, wo: weight * wo[:, 2], "weights over cosine": lambda weight, wo: weight / wo[:, 2]}
     online, both = f"{once} in {PARTS} batches", "its left half, then the right"
-    both_online = f"{both}, in {PARTS} batches"
+    both_online, another = f"{both}, in {PARTS} batches", f"{once} of another density"
     lessons = {none: [], **{counts[n]: batches(particles[:, :n]) for n in COUNTS}, online: batches(some, PARTS),
                weights: among_decoys(), **{what: among_decoys(change) for what, change in changes.items()},
                "its left half": batches(in_turn[:, :half]), "its right half": batches(in_turn[:, half:]),
@@ -123,7 +125,7 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
     loss = zip((found[once] - found[online]).mean(1), DENSITIES, strict=True)
     note = (f"mean ln q {', '.join(f'{found[what].mean():.3f} ({n})' for n, what in counts.items())} particles; {COUNTS[1]} "
             f"in {PARTS} batches instead of 1 lose {', '.join(f'{v:.3f} ({name})' for v, name in loss)}")
-    if constant:
+    if "constant" in declared:
         same = all(np.array_equal(v, found[weights if what in changes else none]) for what, v in found.items() if what != weights)
         return Verdict(same, "densities that learn", float(not same), 0.0, "" if same else "it was declared constant, but learns",
                        note=f"{note}{', as declared' if same else ''}")
@@ -132,13 +134,18 @@ def learn_known(representation: Any, seed: int, constant: bool, parallax: bool, 
         *((what, none, LEAST, np.min) for what in (once, most, online)),
         *((weights, other, LEAST, np.mean) for other in changes),
         *((what, over, MORE, np.max) for what in (both, both_online) for over in ("its left half", "its right half"))]
+    hint = " (who keeps too little to fit it, on purpose, is declared coarse)"
+    if "coarse" in declared:
+        others = (record + REPLICATES) % len(owner)
+        found |= {another: likelihood(teach(lessons[once]), wo, 0.5, others)}
+        asked, hint = [(what, another, LEAST, np.min) for what in (once, online)], ""
     missed = []
     for what, over, least, judge in asked:
         gains = dict(zip(DENSITIES, (found[what] - found[over]).mean(1), strict=True))
         gain = float(judge([gains[name] for name in HARD]))
         if not gain >= least:
             name = min(HARD, key=lambda name: abs(gains[name] - gain))
-            words = f"'{name}' is {gain:+.3f} nats more likely after {what} than after {over}"
+            words = f"'{name}' is {gain:+.3f} nats more likely after {what} than after {over}{hint}"
             missed.append(Verdict(False, "least gain [nats]", gain, least, words, note=note, picture=picture(name, what)))
     if missed:
         return missed[0]

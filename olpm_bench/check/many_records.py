@@ -10,12 +10,12 @@ import numpy as np
 from scipy import stats
 
 from olpm_bench.check.density import ROUNDING, direction
-from olpm_bench.check.particles import normalised, uniform_directions, vector
+from olpm_bench.check.particles import distances, normalised, uniform_directions, vector
 from olpm_bench.check.picture import of_density, over_disk
 from olpm_bench.check.proposal import Proposals
-from olpm_bench.check.purity import FAINT
 from olpm_bench.check.samples import BINS, FEWEST, bin_of, chi_square, of_sums
 from olpm_bench.check.trained import as_numpy
+from olpm_bench.check.trials import FAINT
 from olpm_bench.check.verdict import Panel, Picture, PValues, Verdict, sidak, worst_of
 from representations.interface import ParticleBatch
 from representations.state import bytes_of
@@ -153,11 +153,13 @@ def _of_groups(what: str, sampled: np.ndarray, expected: np.ndarray, variance: n
 
 
 def _lobes(axis: np.ndarray, parallax: bool, rng: np.random.Generator) -> ParticleBatch:
-    """A lobe around the axes of records, of light that is far away, so that it is there from all places; others get nothing."""
+    """A lobe around the axes of records; others get nothing.  Light is nearby, as in training, but for parallax far away, so that
+    it is there from all places.
+    """
     n, record = len(axis), np.repeat(np.arange(0, len(axis), LEARNERS), PARTICLES)
-    at = places(len(record), rng) if parallax else None
+    at, distance = (places(len(record), rng), None) if parallax else (None, mi.Float(distances(len(record), rng)))
     return ParticleBatch.from_arrays(vector(_around(axis[record], rng)), dr.ones(mi.Float, len(record)),
-                                     mi.UInt32(record.astype(np.uint32)), n, None, at)
+                                     mi.UInt32(record.astype(np.uint32)), n, distance, at)
 
 
 def _around(axis: np.ndarray, rng: np.random.Generator) -> np.ndarray:

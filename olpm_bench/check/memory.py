@@ -1,29 +1,22 @@
 """Learning takes no more memory with more particles, or with more batches."""
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import drjit as dr
 import numpy as np
 
 from olpm_bench.check.particles import MILLION, many
-from olpm_bench.check.purity import Trials
-from olpm_bench.check.trained import Trained
-from olpm_bench.check.verdict import Verdict, worst_of
+from olpm_bench.check.trials import Trials, both
+from olpm_bench.check.verdict import Verdict
 from representations.state import bytes_of
 
 COUNTS = (100, 10_000, MILLION)     # particles of each of two records, one batch after the other
 
 
-def stay_bounded(trials: Sequence[Trials], trained: Sequence[Trained]) -> Verdict:
-    """Bytes of a record don't depend on how many particles it has seen, nor in how many batches, unless it is declared that they
-    grow: in few large batches, and in all those of a population.
+@both
+def stay_bounded(trials: Trials) -> Verdict:
+    """Bytes of a record don't depend on how many particles it has seen in a few large batches, unless it is declared that they
+    grow; `long_run` sees many batches.
     """
-    return worst_of({"with parallax" if one.parallax else "": _stay_bounded(one, late)
-                     for one, late in zip(trials, trained, strict=True)})
-
-
-def _stay_bounded(trials: Trials, trained: Trained) -> Verdict:
     rng, state = np.random.default_rng([11, trials.seed]), trials.init(2, trials.seed)
     seen, found = 0, {"at first": bytes_of(state) / 2}
     for index, n in enumerate(COUNTS):
@@ -31,7 +24,6 @@ def _stay_bounded(trials: Trials, trained: Trained) -> Verdict:
         dr.eval(state)
         seen += n
         found[f"after {seen} particles"] = bytes_of(state) / 2
-    found[f"after {len(trained.records.batches)} batches"] = bytes_of(trained.state) / len(trained.records)
     first, most = found["at first"], max(found.values())
     bounded = len(set(found.values())) == 1
     words = ", ".join(f"{size:.0f} bytes a record {when}" for when, size in found.items())

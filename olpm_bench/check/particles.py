@@ -11,8 +11,8 @@ from representations.interface import ParticleBatch
 
 Particles = tuple[np.ndarray, np.ndarray]       # of one record in one batch: wo [n, 3], weight [n]
 BATCHES = 3
-LATE = 80               # batches of records that learn for long, more than the default training has
 MILLION = 1_000_000
+IDENTICAL = 3_000       # particles of one direction
 EDGE = 1e-4             # elevation z of grazing particles
 
 
@@ -50,6 +50,11 @@ def grazing(n: int, rng: np.random.Generator) -> np.ndarray:
     phi = 2 * np.pi * rng.random(n)
     r = np.sqrt(1 - EDGE**2)
     return normalised(np.stack([r * np.cos(phi), r * np.sin(phi), np.full(n, EDGE)], -1))
+
+
+def identical_and(n: int, rng: np.random.Generator) -> np.ndarray:
+    """`IDENTICAL` times the same direction, and n others of some lobes after them [IDENTICAL + n, 3]."""
+    return np.concatenate([np.repeat(uniform_directions(1, rng), IDENTICAL, axis=0), lobes(n, rng)])
 
 
 def vector(wo: np.ndarray) -> mi.Vector3f:
@@ -98,8 +103,15 @@ CONDITIONS: dict[str, Condition] = {
 }
 LONG: dict[str, Condition] = {          # that take time, of one record each
     "a million": lambda rng, copy: and_few([many(100, rng), many(MILLION, rng)], rng),
-    "late": lambda rng, copy: [many(5, rng) for _ in range(LATE)],      # as many as `Proposals` look around
+    "thousands identical": lambda rng, copy: [equal(np.repeat(uniform_directions(1, rng), IDENTICAL, axis=0))],
+    "thousands identical and others": lambda rng, copy: [equal(identical_and(40, rng)), equal(identical_and(20, rng))],
 }
+
+
+def distances(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Lengths of last segments over three decades, a fifth of them infinite [n]."""
+    finite = rng.random(n) < 0.8
+    return np.where(finite, 10 ** rng.uniform(-1.5, 1.5, n), np.inf).astype(np.float32)
 
 
 def landing(wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -110,21 +122,27 @@ def landing(wo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng([11, zlib.crc32(wo.tobytes())])
     n = min(len(wo), 1) if (wo == wo[:1]).all() else len(wo)
     phi, r = 2 * np.pi * rng.random(n), 0.1 * np.sqrt(rng.random(n))
-    distance = np.where(rng.random(n) < 0.8, 10 ** rng.uniform(-1.5, 1.5, n), np.inf)
+    distance = distances(n, rng)
     place = np.stack([r * np.cos(phi), r * np.sin(phi), 0.01 * rng.normal(size=n)], -1)
     return np.broadcast_to(place, (len(wo), 3)), np.broadcast_to(distance, len(wo))
 
 
-def batch(particles: list[Particles], parallax: bool = False, far: bool = False) -> ParticleBatch:
-    """The particles of all records as Dr.Jit arrays; for `parallax` with places and distances, all infinite if `far`."""
+def batch(particles: list[Particles], parallax: bool = False, far: bool = False,
+          unit: np.ndarray | None = None) -> ParticleBatch:
+    """The particles of all records as Dr.Jit arrays, with distances as in training; for `parallax` with places, too.
+
+    far: all distances are infinite.
+    unit: what lengths are multiplied by [n_records].
+    """
     if not any(len(weight) for _, weight in particles):
         return ParticleBatch.empty(len(particles))
     wo, weight = (np.concatenate([p[i] for p in particles]).astype(np.float32) for i in (0, 1))
     record = np.repeat(np.arange(len(particles), dtype=np.uint32), [len(p[1]) for p in particles])
-    if not parallax:
-        return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles))
     landed = zip(*(landing(p[0]) for p in particles if len(p[1])), strict=True)
     at, distance = (np.concatenate(values).astype(np.float32) for values in landed)
+    if unit is not None:
+        scale = unit[record].astype(np.float32)
+        at, distance = at * scale[:, None], distance * scale
     distance = np.full_like(distance, np.inf) if far else distance
     return ParticleBatch.from_arrays(vector(wo), mi.Float(weight), mi.UInt32(record), len(particles), mi.Float(distance),
-                                     vector(at))
+                                     vector(at) if parallax else None)

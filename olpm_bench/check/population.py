@@ -27,6 +27,7 @@ from representations.parallax import aim, inverse
 COPIES = 3                          # records in each condition, with particles of their own
 ASKED = {"beside": 0.08, "afar": 1.5}       # where a record with parallax is asked: deviation of each coordinate [scene units]
 FEW, SAMPLES = 1 << 18, 1 << 14     # samples of a record around at most 10 distinct particles, and of others; half with parallax
+WITHOUT_PLACE = 4                   # times fewer samples, where states with parallax are asked without a place
 MESH = 1 << 14                      # points of the quadrature, for each record
 PROBES = 1 << 10                    # directions of a record that are looked at one by one
 ROTATED = 2.0**-22                  # by how much their lengths are off at most, as of directions that were rotated to a frame
@@ -47,11 +48,13 @@ class Population:
 
     conditions: name of each record's [n_records].
     batches: one list a batch, with the particles of each record.
-    at: the points from which the records are asked, in their frames [n_records, 3]; then particles have places and distances.
+    at: the points from which the records are asked, in their frames [n_records, 3]; None: they are asked without a place.
+    parallax: particles have places.
     """
 
-    def __init__(self, conditions: list[str], batches: list[list[Particles]], seed: int, at: np.ndarray | None = None) -> None:
-        self.conditions, self.batches, self.seed, self.at = conditions, batches, seed, at
+    def __init__(self, conditions: list[str], batches: list[list[Particles]], seed: int, at: np.ndarray | None = None,
+                 parallax: bool = False) -> None:
+        self.conditions, self.batches, self.seed, self.at, self.parallax = conditions, batches, seed, at, parallax
 
     def __len__(self) -> int:
         return len(self.conditions)
@@ -67,9 +70,14 @@ class Population:
     def rng(self, *key: int) -> np.random.Generator:
         return np.random.default_rng([3, self.seed, *key])
 
+    def without_place(self) -> Population:
+        """The same, but asked without a place."""
+        conditions = [f"{name.rpartition(', ')[0]}, without a place" for name in self.conditions]
+        return Population(conditions, self.batches, self.seed, None, self.parallax)
+
     def arrays(self) -> list[ParticleBatch]:
         """The batches for Dr.Jit."""
-        made = [batch(particles, self.at is not None) for particles in self.batches]
+        made = [batch(particles, self.parallax) for particles in self.batches]
         dr.eval(made)
         return made
 
@@ -80,20 +88,22 @@ class Population:
     def _seen(self) -> list[Particles]:
         """Each record's particles, from where it is asked."""
         particles = [self.of(record) for record in range(len(self))]
-        if self.at is None:
+        if not self.parallax:
             return particles
         count = [len(weight) for _, weight in particles]
         landed = [landing(b[record][0]) for record in range(len(self)) for b in self.batches if len(b[record][1])]
         place, distance = (np.concatenate(values) for values in zip(*landed, strict=True))
         learnt = vector(np.concatenate([wo for wo, _ in particles]))
         *centred, near = aim(tuple(learnt), inverse(mi.Float(distance)), -vector(place))
-        seen = np.array(aim(tuple(centred), near, vector(np.repeat(self.at, count, axis=0)))[:3]).T
+        at = np.zeros((len(self), 3)) if self.at is None else self.at
+        seen = np.array(aim(tuple(centred), near, vector(np.repeat(at, count, axis=0)))[:3]).T
         return list(zip(np.split(normalised(seen), np.cumsum(count)[:-1]), [weight for _, weight in particles], strict=True))
 
     @functools.cached_property
     def counts(self) -> np.ndarray:
         """Samples of each record."""
-        return np.where(self.proposals.count <= 10, FEW, SAMPLES) // (1 if self.at is None else 2)
+        fewer = 1 if not self.parallax else WITHOUT_PLACE if self.at is None else 2
+        return np.where(self.proposals.count <= 10, FEW, SAMPLES) // fewer
 
     @functools.cached_property
     def complete(self) -> np.ndarray:
@@ -153,7 +163,7 @@ def population_with_parallax(seed: int) -> Population:
     """Records in every condition, asked from beside the record, and from so far that light gets out of sight."""
     rng, records, asked = np.random.default_rng([2, seed]), _records(len(ASKED)), list(ASKED)
     at = np.stack([ASKED[asked[copy]] * rng.normal(size=3) for _, copy in records]).astype(np.float32)
-    return Population([f"{name}, {asked[copy]}" for name, copy in records], _batches(records, rng), seed, at)
+    return Population([f"{name}, {asked[copy]}" for name, copy in records], _batches(records, rng), seed, at, True)
 
 
 def _records(copies: int, long: bool = True) -> list[tuple[str, int]]:

@@ -11,6 +11,7 @@ from olpm_bench.check.particles import Particles, vector
 
 SMALLEST, LARGEST = 2e-5, 2.0       # chords at which it looks around each particle
 AROUND = 400                        # particles of a record that it looks around, at most: random ones
+MANY = 10_000               # particles of a record among which identical ones are looked for, at most
 LOG_RANGE = float(np.log(LARGEST / SMALLEST))
 
 
@@ -23,6 +24,7 @@ class Proposals:
     """
 
     def __init__(self, particles: Sequence[Particles], rng: np.random.Generator) -> None:
+        particles = [_distinct(*own) if AROUND < len(own[1]) <= MANY else own for own in particles]
         self.complete = np.array([len(weight) <= AROUND for _, weight in particles])      # looks around all of them
         kept = []
         for wo, weight in particles:
@@ -79,3 +81,9 @@ class Proposals:
         share, q = np.where(count > 0, 0.5, 0), np.empty(len(wo))
         q[order] = (1 - share) / (2 * np.pi) + share / (2 * np.pi * LOG_RANGE) * np.array(found, np.float64)
         return q
+
+
+def _distinct(wo: np.ndarray, weight: np.ndarray) -> Particles:
+    """Particles of the same direction as one."""
+    axes, index = np.unique(wo, axis=0, return_inverse=True)
+    return axes, np.bincount(index.ravel(), weight, len(axes))

@@ -13,16 +13,30 @@ from functools import cached_property
 from typing import Any
 
 import representations
-from olpm_bench.check import aiming, density, kernel, learning, many_records, memory, purity, samples, unbiased
+from olpm_bench.check import (
+    aiming,
+    density,
+    kernel,
+    learning,
+    long_run,
+    many_records,
+    memory,
+    new_records,
+    purity,
+    samples,
+    unbiased,
+)
 from olpm_bench.check.population import population, population_with_parallax
 from olpm_bench.check.trained import Trained
-from olpm_bench.check.verdict import Verdict, combined, sidak
+from olpm_bench.check.trials import Trials
+from olpm_bench.check.verdict import Verdict, combined, sidak, worst_of
 from olpm_bench.suggest import closest
 from olpm_bench.transport.settings import InputError
 
 LEVEL = 1e-4            # false alarms of a whole run
 
-DECLARATIONS = {"constant": "learns nothing on purpose", "grows": "keeps all of its particles on purpose"}
+DECLARATIONS = {"constant": "learns nothing on purpose", "grows": "keeps all of its particles on purpose",
+                "coarse": "keeps too little to fit several narrow lobes on purpose"}
 
 
 class Subject:
@@ -64,9 +78,14 @@ class Subject:
         return Trained(self.representation, population_with_parallax(self.seed))
 
     @cached_property
-    def trials(self) -> list[purity.Trials]:
+    def aimed_everywhere(self) -> dict[str, Trained]:
+        """The state with parallax, by how it is asked."""
+        return {"": self.aimed, "asked without a place": self.aimed.without_place()}
+
+    @cached_property
+    def trials(self) -> list[Trials]:
         """Without and with parallax."""
-        return [purity.Trials(self.specification, self.seed, parallax, "grows" in self.declared) for parallax in (False, True)]
+        return [Trials(self.specification, self.seed, parallax, "grows" in self.declared) for parallax in (False, True)]
 
 
 @dataclass(frozen=True)
@@ -76,6 +95,15 @@ class Check:
     sentence: str
     run: Callable[[Subject, float], Verdict]
     statistical: bool = False
+
+
+def _with_parallax(check: Callable[..., Verdict], statistical: bool = False) -> Callable[[Subject, float], Verdict]:
+    """The check of states with parallax, however they are asked."""
+    def run(subject: Subject, level: float) -> Verdict:
+        asked = subject.aimed_everywhere
+        levels = (sidak(level, len(asked)),) * statistical
+        return worst_of({how: check(aimed, *levels) for how, aimed in asked.items()})
+    return run
 
 
 CHECKS = (
@@ -88,27 +116,30 @@ CHECKS = (
           lambda s, level: kernel.keep_balance(s.representation, s.seed, level), statistical=True),
     Check("inactive-lanes", "lanes that are switched off read and change nothing",
           lambda s, _: samples.mind_active((s.trained, s.aimed))),
-    Check("parallax-density", "as density, asked from beside the record", lambda s, _: density.is_valid(s.aimed)),
-    Check("parallax-integral", "as integral, asked from beside the record",
-          lambda s, level: density.integral(s.aimed, level), statistical=True),
-    Check("parallax-reported", "as reported-pdf, asked from beside the record", lambda s, _: samples.report_pdf(s.aimed)),
-    Check("parallax-samples", "as samples, asked from beside the record",
-          lambda s, level: samples.follow_pdf(s.aimed, level), statistical=True),
+    Check("parallax-density", "as density, asked from beside the record, or without a place", _with_parallax(density.is_valid)),
+    Check("parallax-integral", "as integral, asked from beside the record, or without a place",
+          _with_parallax(density.integral, statistical=True), statistical=True),
+    Check("parallax-reported", "as reported-pdf, asked from beside the record, or without a place",
+          _with_parallax(samples.report_pdf)),
+    Check("parallax-samples", "as samples, asked from beside the record, or without a place",
+          _with_parallax(samples.follow_pdf, statistical=True), statistical=True),
     Check("many-records", "none of ten thousands of records is wrong",
           lambda s, level: many_records.are_right(s.representation, s.seed, level), statistical=True),
     Check("purity", "same input, same bits; arguments are left alone", lambda s, _: purity.stay_pure(s.trials)),
     Check("independence", "other records, and the order of records, don't matter",
           lambda s, level: purity.be_independent(s.trials, level), statistical=True),
-    Check("scale", "the scale of weights doesn't matter", lambda s, _: purity.ignore_scale(s.trials)),
+    Check("scale", "the scales of weights and of lengths don't matter", lambda s, _: purity.ignore_scale(s.trials)),
     Check("nothing-new", "no particles, or of no weight, teach nothing", lambda s, _: purity.ignore_nothing(s.trials)),
     Check("new-records", "states are stored; appended records begin fresh, learn, and disturb none",
-          lambda s, _: purity.take_new_records(s.trials)),
+          lambda s, _: new_records.take_new_records(s.trials)),
     Check("learning", "held-out directions become more likely with particles",
-          lambda s, level: learning.learn(s.representation, s.seed, "constant" in s.declared, level), statistical=True),
+          lambda s, level: learning.learn(s.representation, s.seed, s.declared, level), statistical=True),
     Check("aiming", "aims at light nearby from where it is asked, if it minds that",
           lambda s, _: aiming.aim(s.representation, s.seed)),
+    Check("long-run", "hundreds of batches wear out, inflate or enlarge no record",
+          lambda s, level: long_run.last(s.trials, level), statistical=True),
     Check("memory", "bytes a record don't grow with particles",
-          lambda s, _: memory.stay_bounded(s.trials, (s.trained, s.aimed))),
+          lambda s, _: memory.stay_bounded(s.trials)),
     Check("furnace", "guided, a closed box keeps its radiance",
           lambda s, level: unbiased.keep_the_furnace(s.specification, s.seed, level), statistical=True),
     Check("image", "guided, an image keeps its expectation",

@@ -36,16 +36,25 @@ def as_numpy(value: Any, n: int) -> np.ndarray:
     return np.array(value, np.float64) * np.ones(n)
 
 
-class Trained:
+def taught(representation: Any, records: Population) -> Any:
     """A state of all records of a population, after all of its batches."""
+    state = representation.init(len(records), records.seed, records.parallax)
+    for index, batch in enumerate(records.arrays()):
+        state = representation.update(state, batch, records.seed + index)
+        dr.eval(state)
+    return state
 
-    def __init__(self, representation: Any, records: Population) -> None:
+
+class Trained:
+    """A state of all records of a population, after all of its batches unless it is given."""
+
+    def __init__(self, representation: Any, records: Population, state: Any = None) -> None:
         self.representation, self.records = representation, records
-        state = representation.init(len(records), records.seed, records.at is not None)
-        for index, batch in enumerate(records.arrays()):
-            state = representation.update(state, batch, records.seed + index)
-            dr.eval(state)
-        self.state = state
+        self.state = taught(representation, records) if state is None else state
+
+    def without_place(self) -> Trained:
+        """The same state, but asked without a place."""
+        return Trained(self.representation, self.records.without_place(), self.state)
 
     def at(self, record: np.ndarray) -> mi.Vector3f | None:
         return None if self.records.at is None else vector(self.records.at[record])

@@ -33,7 +33,7 @@ def keep_the_furnace(specification: dict[str, Any], seed: int, level: float) -> 
     """A closed box of albedo a that emits 1: radiance 1 / (1 - a) everywhere, whatever the guide believes."""
     scene, expected, p_values, skewness = furnace(ALBEDO, OVERLAP), 1 / (1 - ALBEDO), PValues(), 0.0
     # Paths long enough that what is cut off, a^40, doesn't show
-    for how, guide in _guides(scene, specification, seed):
+    for how, guide in _guides(scene, specification, seed, parallax=False):
         images = passes(scene, olpm_bench.integrator(guide, max_depth=40, rr_depth=8), PASSES, SPP, _seed(seed))
         skewness = max(skewness, _test(p_values, images, np.full_like(images[0], expected), None, f"the furnace, {how}"))
     return p_values.verdict(level, f"{2 * PASSES} images of {SPP} samples a pixel, blocks of a skewness up to {skewness:.1f}")
@@ -47,7 +47,7 @@ def keep_the_image(specification: dict[str, Any], seed: int, level: float) -> Ve
     scene = mi.load_dict(content, parallel=False, optimize=False)       # in one order, which has the same kernels each time
     reference = passes(scene, mi.load_dict({"type": "path", "max_depth": DEPTH}), PASSES, SPP, _seed(seed) + PASSES)
     p_values, skewness = PValues(), 0.0
-    for how, guide in _guides(scene, specification, seed):
+    for how, guide in _guides(scene, specification, seed, parallax=True):
         images = passes(scene, olpm_bench.integrator(guide, max_depth=DEPTH), PASSES, SPP, _seed(seed))
         skewness = max(skewness, _test(p_values, images, reference.mean(0), reference, f"the box, {how}"))
     return p_values.verdict(level, f"{3 * PASSES} images of {SPP} samples a pixel, blocks of a skewness up to {skewness:.1f}")
@@ -58,17 +58,22 @@ def _seed(seed: int) -> int:
     return 1000 + 4 * PASSES * seed
 
 
-def _guides(scene: mi.Scene, specification: dict[str, Any], seed: int) -> Iterator[tuple[str, Guide]]:
+def _guides(scene: mi.Scene, specification: dict[str, Any], seed: int, parallax: bool) -> Iterator[tuple[str, Guide]]:
+    """Trained on the scene, with or without `parallax`, then on garbage, the other way: each scene is rendered with both."""
     olpm_bench.register()
     from olpm_bench.transport.training import Training
 
-    training = Training(scene, specification, settings.training(**TRAINING), settings.integrator(max_depth=DEPTH), seed)
+    words = {True: "with parallax", False: "without parallax"}
+    training = Training(scene, specification, settings.training(**TRAINING, parallax=parallax),
+                        settings.integrator(max_depth=DEPTH), seed)
     for _ in training.run():
         pass
     guide = training.radiance
-    yield f"trained on the scene ({guide.trained:.0%} of {guide.records} records guide)", guide
+    share = f"({guide.trained:.0%} of {guide.records} records guide)"
+    yield f"trained on the scene {words[parallax]} {share}", guide
+    guide.parallax = not parallax
     teach_garbage(guide, seed)
-    yield f"trained on garbage ({guide.trained:.0%} of {guide.records} records guide)", guide
+    yield f"trained on garbage {words[not parallax]} {share}", guide
 
 
 def teach_garbage(guide: Guide, seed: int) -> None:

@@ -10,7 +10,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from olpm_bench.check import examination, suite
-from olpm_bench.check.particles import CONDITIONS, LATE, LONG, many, nothing, uniform_directions
+from olpm_bench.check.particles import BATCHES, CONDITIONS, IDENTICAL, LONG, many, nothing, uniform_directions
 from olpm_bench.check.picture import CELL, over_disk
 from olpm_bench.check.population import ASKED, population, population_with_parallax
 from olpm_bench.check.proposal import Proposals
@@ -69,7 +69,7 @@ def test_proposals_have_their_density() -> None:
 
 def test_every_condition_is_in_both_populations() -> None:
     records = population(0)
-    assert set(records.conditions) == {*CONDITIONS, *LONG} and len(records.batches) == LATE
+    assert set(records.conditions) == {*CONDITIONS, *LONG} and len(records.batches) == BATCHES
     assert max(len(records.of(r)[1]) for r in range(len(records))) > 1_000_000
     empty = [r for r in range(len(records)) if len(records.of(r)[1]) == 0]
     assert empty and all(records.conditions[r] in ("untrained", "few at a time") for r in empty)
@@ -77,6 +77,11 @@ def test_every_condition_is_in_both_populations() -> None:
     aimed = population_with_parallax(0)
     everywhere = {f"{name}, {asked}" for name in CONDITIONS for asked in ASKED}
     assert set(aimed.conditions) == everywhere | {f"{name}, {next(iter(ASKED))}" for name in LONG}
+    thousands = records.conditions.index("thousands identical")
+    assert len(records.of(thousands)[1]) == IDENTICAL and records.proposals.count[thousands] == 1
+    assert all(batch.at is not None for batch in aimed.arrays() if len(batch))
+    finite = [np.isfinite(batch.distance).mean() for batch in records.arrays()]
+    assert all(batch.at is None for batch in records.arrays()) and min(finite) > 0.5        # as in training
     identical = aimed.conditions.index("ten identical, beside")
     assert len(aimed.of(identical)[1]) == 10 and aimed.proposals.count[identical] == 1 and aimed.complete[identical]
 
@@ -138,6 +143,21 @@ def test_a_declaration_is_believed_only_if_it_is_true() -> None:
     assert call("cosine", "--only", "learning", "--declare", "constant").exit_code == 0
     assert call("jensen", "--only", "learning", "--declare", "constant").exit_code == 1
     assert call(f"{MUTANTS}:MemoryGrows", "--only", "memory", "--declare", "grows").exit_code == 0
+
+
+@pytest.mark.parametrize(("name", "setting"), [("hey", "cones=1"), ("hey", "cones=4"), ("jensen", "resolution=2"),
+                                              ("gaussian_mixture", "components=1")])
+def test_what_keeps_little_is_valid_if_it_says_so(name: str, setting: str) -> None:
+    """One cone is a density; it learns one particle of a thousand, and aims at it, and is too wide for more."""
+    command = [name, "--set", f"representation.{setting}", "--only", "learning", "--only", "aiming"]
+    result = call(*command)
+    assert result.exit_code == 1 and "1 of 2 checks FAILED" in result.stdout and "is declared coarse" in result.stdout
+    assert call(*command, "--declare", "coarse").exit_code == 0
+
+
+def test_who_learns_nothing_is_not_coarse() -> None:
+    assert call("jensen", "--set", "representation.resolution=1", "--only", "learning", "--declare", "coarse").exit_code == 1
+    assert call("cosine", "--only", "learning", "--declare", "coarse").exit_code == 1
 
 
 def test_a_campaign_counts_alarms(tmp_path: Path) -> None:
@@ -237,7 +257,7 @@ def test_a_logged_run_without_its_p_values_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["nosuch"], "unknown representation 'nosuch'"), (["jensen", "--only", "nosuch"], "unknown check 'nosuch'; known: density"),
-    (["jensen", "--declare", "nosuch"], "--declare nosuch: must be one of constant, grows"),
+    (["jensen", "--declare", "nosuch"], "--declare nosuch: must be one of constant, grows, coarse"),
     (["missing.py:Mine"], "there is no such file"), (["jensen", "--set", "representation.bins=3"], "no parameter 'bins'")])
 def test_bad_input(arguments: list[str], words: str) -> None:
     result = call(*arguments)

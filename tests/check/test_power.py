@@ -1,6 +1,7 @@
 """Comparisons of samples with densities: their p-values are uniform if nothing is wrong, and what they find."""
 from __future__ import annotations
 
+import elusive_mutants
 import mutants
 import numpy as np
 import pytest
@@ -20,10 +21,10 @@ SEEDS, LEVEL = 24, 1e-3
 @pytest.fixture
 def p_values(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float]]:
     """All p-values that the checks find, by what their words begin with; nothing is forgiven, and there are fewer samples."""
-    found: dict[str, list[float]] = {"sum": [], "lanes": [], "blocks": [], "bins": []}
+    found: dict[str, list[float]] = {"sum": [], "lanes": [], "blocks": [], "bins": [], "cells": []}
 
     def add(self, p, words, picture=None):
-        kind = next((k for k in found if f"{k} of" in words), "sum" if "differ by" in words else "bins")
+        kind = next((k for k in found if f" {k} of" in words), "sum" if "differ by" in words else "bins")
         found[kind].append(p)
         self.found.append((p, words, picture))
 
@@ -43,7 +44,7 @@ def small_population(seed: int) -> population.Population:
 
 @pytest.mark.parametrize("representation", [CosineLobe(), JensenHistogram()], ids=["cosine", "jensen"])
 def test_p_values_are_uniform_if_nothing_is_wrong(representation, p_values) -> None:
-    """Those of sums, lanes and blocks; those of bins are no smaller (they are of bounds on the variance)."""
+    """Those of sums, lanes and blocks; those of bins and cells are no smaller (they are of bounds on variance and tail)."""
     for seed in range(SEEDS):
         samples.follow_pdf(Trained(representation, small_population(seed)), 0.01)
         if seed % 3 == 0:
@@ -52,6 +53,7 @@ def test_p_values_are_uniform_if_nothing_is_wrong(representation, p_values) -> N
         assert stats.kstest(p_values[kind], "uniform").pvalue > LEVEL, (kind, np.sort(p_values[kind]))
     assert len(p_values["sum"]) == 4 * SEEDS + 3 * (SEEDS // 3)
     assert stats.kstest(p_values["bins"], "uniform", alternative="greater").pvalue > LEVEL
+    assert min(p_values["cells"]) * len(p_values["cells"]) > LEVEL      # they are tested at the smallest p of many
 
 
 def test_bins_at_the_rim_of_a_lobe_raise_no_alarm(p_values) -> None:
@@ -70,3 +72,20 @@ def test_two_percent_are_found_in_few_samples(p_values) -> None:
     assert p_values["sum"][0] < 1e-9 and min(p_values["bins"]) > 1e-3
     many_records.are_right(mutants.UntrainedTwoPercent(), 0, 0.01)
     assert p_values["sum"][-1] < 1e-4 and min(p_values["bins"]) > 1e-3
+
+
+@pytest.mark.parametrize("points", [2, 3, 5, 50])
+def test_tosses_of_a_fair_coin_raise_no_alarm(points: int) -> None:
+    """At levels that matter, of the smallest of hundreds of p-values, they are no more frequent than stated."""
+    rng, cells, trials = np.random.default_rng(points), 20, 100_000
+    uneven = (2 * rng.binomial(points, 0.5, (trials, cells)) - points) ** 2 / points
+    mean, variance = cells, cells * (2 - 2 / points)
+    p = stats.chi2.sf(uneven.sum(1) * 2 * mean / variance, 2 * mean**2 / variance)
+    for level in (1e-2, 1e-3, 1e-4):
+        assert stats.binomtest(int((p < level).sum()), trials, level, "greater").pvalue > LEVEL
+
+
+def test_slivers_that_are_never_sampled_are_found_at_a_fine_scale_only() -> None:
+    """They hold 3 % of the mass, spread over all bins of little mass; the sums and the bins of 1/16 don't show them."""
+    outcome = samples.follow_pdf(Trained(elusive_mutants.PlaceByTheChoice(), population.population(0)), 1e-5)
+    assert not outcome.passed and "cells of 1/32 of the square's edge" in outcome.worst
