@@ -12,6 +12,7 @@ not better.  All claims must hold, which needs no correction for their number.
 """
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -141,7 +142,8 @@ def print_verdicts(verdicts: list[Verdict], console: Console | None = None) -> N
         table.add_column(name, justify="right" if name in ("ratio", "bounds") else "left", no_wrap=True)
     for v in verdicts:
         claim = f"{v.claim.metric} of {v.claim.better} <= {v.claim.ratio:g} x that of {v.claim.worse}"
-        bounds = f"{number(v.low)}-{number(v.high)} ({v.claim.confidence:.3g} each)"
+        ends = f"{number(v.low)}-{number(v.high)}" if math.isfinite(v.high) else f"{number(v.low)} or more"
+        bounds = f"{ends} ({v.claim.confidence:.3g} each)"
         table.add_row(Text(v.scene), Text(claim), number(v.ratio), bounds,
                       Text(str(v), style="green" if v.holds else "bold red"))
     print_whole(table, console or plain_console())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from olpm_bench.bench import cell, config, experiment_file, plan, reference_file, run
+from olpm_bench.bench import cell, config, experiment_file, plan, run
 from olpm_bench.transport import settings
 
 FOLDER = Path(__file__).resolve().parents[2] / "experiments"
@@ -147,12 +147,12 @@ EMBEDDED = [name for name, table in FILES.items() if not any("file" in scene for
 
 @pytest.mark.parametrize("name", EMBEDDED)
 def test_embedded_scenes_come_with_their_reference(name):
-    """At the experiment's resolution, of an unguided estimator, with halves and their variance; a key that moves orphans it."""
+    """At the experiment's resolution or a multiple, of an unguided estimator, with halves and their variance; a key that moves
+    orphans it."""
     experiment = experiment_file.load(FOLDER / name)
+    references = run.references(experiment, FOLDER.parent / "results")
     for scene in (scene for scene in experiment.scene if scene.has_reference):
-        path = reference_file.find_reference(experiment.reference_key(scene), [FOLDER.parent / "results" / "references"])
-        assert path is not None, experiment.reference_key(scene)
-        reference = reference_file.read_reference(path, scene.width, scene.height)
+        reference = references[scene.name]
         assert reference.has_halves and reference.mean.shape == (scene.height, scene.width, 3)
         assert 0 < reference.noise_floor < 0.1 * reference.mean.mean()
 

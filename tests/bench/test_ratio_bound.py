@@ -16,14 +16,14 @@ FALSE_ALARMS = 0.07         # of claims at 95 % at a true ratio of 1, in each fa
 LEVEL = 1e-3                # of each test
 
 
-def test_the_bounds_are_where_the_mean_difference_is_cantellis_number_of_standard_errors_away():
+def test_the_bound_is_where_the_mean_difference_is_as_far_away_as_it_says():
     rng = np.random.default_rng(1)
     a, b = rng.gamma(2, 1, MIN_SEEDS), rng.gamma(3, 1, MIN_SEEDS)
     found = ratio_bound(a, b, 0.95)
     assert found.value == a.mean() / b.mean()
-    for ratio, deviations in ((found.high, -np.sqrt(19)), (found.low, np.sqrt(19))):
-        difference = a - ratio * b
-        assert difference.mean() / stats.sem(difference) == pytest.approx(deviations)
+    t = stats.t.ppf(0.975, MIN_SEEDS - 1)
+    reach = np.sqrt(t**2 * stats.sem(a - found.high * b) ** 2 + (19 - t**2) * stats.sem(a) ** 2)
+    assert found.high * b.mean() - a.mean() == pytest.approx(reach)
 
 
 def test_the_bounds_of_the_inverse_are_the_inverse_bounds():
@@ -33,10 +33,10 @@ def test_the_bounds_of_the_inverse_are_the_inverse_bounds():
     assert (1 / back.high, 1 / back.low) == pytest.approx((there.low, there.high))
 
 
-def test_what_the_seeds_share_does_not_widen_the_bounds():
-    shared = np.random.default_rng(3).lognormal(0, 0.5, MIN_SEEDS)
-    found = ratio_bound(0.5 * shared, shared, 0.95)
-    assert found.low == pytest.approx(0.5, rel=1e-6) and found.high == pytest.approx(0.5, rel=1e-6)
+def test_an_outlier_of_the_better_method_widens_the_bound_more_than_one_of_the_worse():
+    ones, outlier = np.ones(MIN_SEEDS), 1 + np.eye(1, MIN_SEEDS)[0]
+    assert ratio_bound(outlier, ones, 0.95).high == pytest.approx(1 + (1 + np.sqrt(19)) / MIN_SEEDS)
+    assert 1 < ratio_bound(ones, outlier, 0.95).high < 1 + 2 / MIN_SEEDS
 
 
 def test_unseen_events_widen_a_bound_by_what_they_add():
@@ -72,6 +72,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray
     "fireflies in one of 10 seeds of the better": lambda rng: (with_fireflies(rng, 0.1, 5), spread(rng, 0.05)),
     "fireflies in one of 14 seeds of the better": lambda rng: (with_fireflies(rng, 0.07, 13), spread(rng, 0.05)),
     "fireflies in one of 10 seeds of the worse": lambda rng: (spread(rng, 0.05), with_fireflies(rng, 0.1, 5)),
+    "no noise in one of 14 seeds of the worse": lambda rng: (spread(rng, 0.05), (rng.random(MIN_SEEDS) >= 0.07) / 0.93),
     "log-normal, the better 1, the worse 0.2": lambda rng: (spread(rng, 1.0), spread(rng, 0.2)),
     "log-normal, the better 1.5, the worse 0.2": lambda rng: (spread(rng, 1.5), spread(rng, 0.2)),
     "log-normal, the better 0.2, the worse 1": lambda rng: (spread(rng, 0.2), spread(rng, 1.0)),
@@ -95,10 +96,11 @@ def test_claims_on_errors_that_are_false_by_a_hair_hold_as_rarely_as_they_say(fa
 
 @pytest.mark.slow
 def test_claims_that_are_true_hold_as_often_as_they_say():
-    """Independent normal errors of the spread v / sqrt(2) each have differences of about v."""
-    v, trials = 0.2 * np.sqrt(2), 1000
-    true_ratio = 1 - (np.sqrt(19) + stats.norm.ppf(0.95)) * v / np.sqrt(MIN_SEEDS)
-    assert 0.7 < true_ratio < 0.75
+    """Independent normal errors with a standard deviation of a fifth."""
+    v, trials = 0.2, 1000
+    t = stats.t.ppf(0.975, MIN_SEEDS - 1)
+    true_ratio = 1 - v * (np.sqrt(19 + t**2) + np.sqrt(2) * stats.norm.ppf(0.95)) / np.sqrt(MIN_SEEDS)
+    assert true_ratio == pytest.approx(0.773, abs=0.002)
     assert stats.binomtest(held("normal", 1.0, trials, true_ratio), trials, 0.95, alternative="less").pvalue > LEVEL
 
 
