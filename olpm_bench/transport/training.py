@@ -50,7 +50,7 @@ class PassStatistics:
     importons: int = 0
     spp: int = 0                    # of the image that a camera pass rendered
     stored: int = 0                 # hits of photons, or vertices of camera paths
-    kept: int = 0                   # of which taught a record
+    kept: int = 0                   # of which taught a record; those that taught several count for each
     records: int = 0                # of the radiance guide
     regions: dict[str, np.ndarray] = field(default_factory=dict)    # where a caller names them: `Particles.by_region`
     seen: float = 0.0               # particles seen so far by the records that camera paths met, on average
