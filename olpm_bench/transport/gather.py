@@ -4,7 +4,7 @@ Three ways, all deterministic:
 
 * `binned`: a particle goes to the record that its own look-up finds; of more than `neighbours`, evenly spaced ones
   are kept and stand for the others.  One sort, O(1) a particle.
-* `pooled`: so, too, but a record with fewer than `neighbours` also learns from the particles of the records around it.  Many
+* `pooled`: so, too, but a record with few also learns from the particles of the records around it.  Many
   camera paths meet no light, and small records would each learn from hardly any.
 * `nearest`: each record takes exactly the `neighbours` nearest particles within r_max, as in the paper [L], however small
   its validity radius.
@@ -32,6 +32,7 @@ DIGIT_BITS, DIGITS = 8, 3   # of the squared distances, for selection by radix
 FARTHEST = 2 ** (DIGIT_BITS * DIGITS) - 1       # the largest of them, just within r_max
 FINEST = 4                  # times that the edge of voxels is halved for records among many particles
 FLAT = 0.35                 # of the particles of 27 voxels, those of a plane within one edge: pi / 9
+ENOUGH = 250                # particles of a pass; a record with fewer learns from those of others, too
 LENDERS = 9                 # records that one learns from, itself included, ...
 FARTHEST_LENDER = 4.0       # ... and their distance / r_max, at most
 AMPLE = 2.0                 # expected particles within an edge / those that a record takes
@@ -75,10 +76,13 @@ def binned(cache: RecordCache, particles: Particles, neighbours: int, parallax: 
 
 
 def pooled(cache: RecordCache, particles: Particles, neighbours: int, parallax: bool = False) -> Gathered:
-    """The particles that fall to each record; where these are fewer than `neighbours`, also those of records around it.
+    """The particles that fall to each record; where these are fewer than `ENOUGH`, also those of records around it.
 
     The bandwidth follows the density of particles, as that of the k nearest does: where records are small and particles are
     few, each record would learn from hardly any.  Records lend in the order of their distance until there are enough.
+
+    Args:
+        neighbours: particles of a record, at most; also instead of `ENOUGH` where it is smaller.
     """
     if len(particles) == 0:
         return _nothing(cache)
@@ -89,7 +93,7 @@ def pooled(cache: RecordCache, particles: Particles, neighbours: int, parallax: 
         return _nothing(cache)
     first = offset.numpy().astype(np.int64)
     found = np.diff(first)
-    borrower, lender = _lenders(cache, found, neighbours)
+    borrower, lender = _lenders(cache, found, min(ENOUGH, neighbours))
     # One entry for each particle of each lender, grouped by borrower
     lent = found[lender]
     entry = np.arange(lent.sum()) + np.repeat(first[lender] - (np.cumsum(lent) - lent), lent)
@@ -113,18 +117,18 @@ def pooled(cache: RecordCache, particles: Particles, neighbours: int, parallax: 
     return _batch(cache, particles, place, record, stands_for, reach, reach, parallax)
 
 
-def _lenders(cache: RecordCache, found: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
+def _lenders(cache: RecordCache, found: np.ndarray, enough: int) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of records, of which the first learns from the particles of the second; ordered by the first, then by distance.
 
     Args:
         found: particles of each record [n_records].
-        neighbours: so many are enough.
+        enough: from so many on a record borrows no more.
     """
     k = min(LENDERS, len(cache))
     index, distance, cosine = nearest_points(cache.points, cache.points, k, cache.radius)
     lent = found[index] * ((cosine >= MIN_COSINE) & (distance <= FARTHEST_LENDER * cache.radius))
     before = np.cumsum(lent, axis=1) - lent
-    used = (lent > 0) & (before < neighbours)
+    used = (lent > 0) & (before < enough)
     return np.nonzero(used)[0], index[used]
 
 

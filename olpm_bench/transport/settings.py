@@ -82,7 +82,7 @@ class TrainingSettings:
     while_rendering: go on learning from the paths of every rendering pass.
     gather: "binned": the particles whose look-up gives the record, at most `neighbours` of them;
         "nearest": exactly the `neighbours` nearest within the record radius, as in the paper.  (Camera paths are binned, too, and
-        records with fewer than `neighbours` vertices also learn from those around them.)
+        records with few vertices also learn from those around them.)
     neighbours: particles of a pass used by a record, at most [L: 250].
     record_radius: largest validity radius of a record, as a share of the diagonal of what the camera and its paths see, which
         is at most ten times as long as their median segment (`transport.seen_extent`) [L: 0.01, of the scene's diagonal].

@@ -53,7 +53,7 @@ class PassStatistics:
     importons: int = 0
     spp: int = 0                    # of the image that a camera pass rendered
     stored: int = 0                 # hits of photons, or vertices of camera paths
-    kept: int = 0                   # of which taught a record
+    kept: int = 0                   # of which taught a record; those that taught several count for each
     unusable: int = 0               # particles and vertices left out, since a value was NaN, infinite or negative
     records: int = 0                # of the radiance guide
     regions: dict[str, np.ndarray] = field(default_factory=dict)    # where a caller names them: `Particles.by_region`

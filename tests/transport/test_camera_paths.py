@@ -78,8 +78,8 @@ def test_direct_light_that_the_guide_learns():
     scene = mi.load_dict(content, optimize=False)
     learnt = {}
     for direct in (True, False):
-        training = Training(scene, "gaussian_mixture", settings.training(passes=0, camera_paths=2**15, learn_direct=direct),
-                            settings.integrator(max_depth=DEPTH))
+        few_records = settings.training(passes=0, camera_paths=2**15, learn_direct=direct, record_radius=0.1)
+        training = Training(scene, "gaussian_mixture", few_records, settings.integrator(max_depth=DEPTH))
         for _ in range(3):
             training.camera_pass()
         paths = CameraPaths(training.pixels, 64, DEPTH)

@@ -211,6 +211,16 @@ def departures(*x: float, n: int = 5000) -> Departures:
     return Departures(mi.Point3f(p), mi.Vector3f(d / np.linalg.norm(d, axis=0)), dr.ones(mi.Float, n), dr.zeros(mi.UInt32, n))
 
 
+def test_the_guided_disk_is_as_small_as_the_window_on_a_plain_of_40_km():
+    """Importons leave within 0.2 units: a share of the scene's radius would be 28 of them."""
+    scene = room(sky=light("constant"))
+    guide = EmissionGuide(scene, mi.ScalarBoundingBox3f((-2e4, -2e4, -1), (2e4, 2e4, 1)), 0.2)
+    guide.learn(departures(-0.8), 0)
+    alone = EmissionGuide(scene, surface_bounds(scene), 0.2)
+    alone.learn(departures(-0.8), 0)
+    assert float(guide.guided_radius[0]) < max(2 * float(alone.guided_radius[0]), 1.01e-5 * guide.radius) < 1
+
+
 def test_another_way_out_is_learnt_when_importons_find_it():
     """A disk over the first window alone would start no photon above the second."""
     guide = EmissionGuide(scene := room(sky=light("constant")), surface_bounds(scene), 0.2)

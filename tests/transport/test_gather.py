@@ -9,7 +9,7 @@ from small_scenes import box, grey
 
 from olpm_bench.transport import gather
 from olpm_bench.transport.cache import RecordCache
-from olpm_bench.transport.gather import FARTHEST_LENDER, LENDERS, MIN_COSINE, MIN_ELEVATION, binned, nearest, pooled
+from olpm_bench.transport.gather import ENOUGH, FARTHEST_LENDER, LENDERS, MIN_COSINE, MIN_ELEVATION, binned, nearest, pooled
 from olpm_bench.transport.particles import emit_photons, trace
 from olpm_bench.transport.training import surface_bounds
 
@@ -70,8 +70,8 @@ def test_binned_are_those_that_look_the_record_up(landed):
 
 
 def test_pooled_records_with_few_particles_learn_from_those_around_them(landed):
-    cache, particles = landed
-    wanted = 600
+    cache, particles = landed[0], landed[1].one_of(4)
+    wanted = ENOUGH
     own = binned(cache, particles, 10 ** 6).count().numpy()
     batch = pooled(cache, particles, wanted, parallax=True)
     count = batch.count().numpy()

@@ -14,6 +14,7 @@ import representations
 from olpm_bench.scenes.load import load
 from olpm_bench.transport import settings
 from olpm_bench.transport.estimates import FLOOR
+from olpm_bench.transport.gather import LENDERS
 from olpm_bench.transport.guide import Guide
 from olpm_bench.transport.training import Training, train
 from representations import state as states
@@ -41,7 +42,8 @@ def test_guides_learn_on_line(scene, name):
     guide = train(scene, name, SMALL, PATHS, on_pass=seen.append)
     assert [s.index for s in seen] == [0, 1, 2, 3, 4]
     assert [s.image is None for s in seen] == [True, True, True, False, False]
-    assert all(s.stored > 10_000 and 0 < s.kept <= s.stored for s in seen)
+    assert all(s.stored > 10_000 and s.kept > 0 for s in seen)
+    assert all(s.kept <= (s.stored if s.image is None else LENDERS * s.stored) for s in seen)
     assert guide.particles == sum(s.kept for s in seen)
     assert guide.records == seen[-1].records > 100
     enough, fraction, outgoing, _ = guide.rows.numpy().reshape(-1, 4).T
