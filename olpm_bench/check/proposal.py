@@ -66,6 +66,8 @@ class Proposals:
 
     def pdf(self, record: np.ndarray, wo: np.ndarray) -> np.ndarray:
         """q at directions above the horizon [n]."""
+        if len(wo) == 0:                    # all samples have failed
+            return np.zeros(0)
         order = np.argsort(record, kind="stable")           # neighbours loop over the same particles
         first, count = self.first[record[order]], self.count[record[order]]
         axes, mass = vector(self.axis), mi.Float(self.mass.astype(np.float32))

@@ -58,6 +58,7 @@ def test_proposals_have_their_density() -> None:
     """E_q[1 / q] over what lies above the horizon is the hemisphere's solid angle, q at all scales around a particle."""
     rng = np.random.default_rng(1)
     proposals, n = Proposals([nothing(), many(5, rng), many(1000, rng)], rng), 1 << 15
+    assert len(proposals.pdf(np.zeros(0, int), np.zeros((0, 3)))) == 0
     for record in range(3):
         index = np.full(n, record)
         wo = proposals.at(index, rng.random((n, 3)))
