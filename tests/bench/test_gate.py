@@ -227,13 +227,9 @@ def test_the_gate_fails_when_a_claim_is_turned_round(tmp_path):
 
 @pytest.mark.slow
 def test_the_gate_of_this_project_refuses_garbage(tmp_path):
-    """experiments/gate.toml with fewer pixels and paths, against histograms only: a mixture that learns from random directions
-    fails.  That the one that learns from particles passes is what the gate itself tells."""
+    """experiments/gate.toml against histograms only: a mixture that learns from random directions fails, at 2.2 times the error.
+    That the one that learns from particles passes is what the gate itself tells: .36 (.23-.54)."""
     text = (ROOT / "experiments" / "gate.toml").read_text()
-    for whole, part in (("width = 48", "width = 32"), ("height = 27", "height = 18"), ("spp = 8", "spp = 4"),
-                        ("camera_paths = 32_768", "camera_paths = 8_192")):
-        assert whole in text
-        text = text.replace(whole, part)
     first, _, rest = text.partition('[[method]]\nname = "Hey"')
     rest = rest[rest.index("[[method]]"):].partition('[[claim]]\nbetter = "GMM"\nworse = "Hey"')[0]
     (tmp_path / "experiments").mkdir()
@@ -243,3 +239,5 @@ def test_the_gate_of_this_project_refuses_garbage(tmp_path):
     result = call(tmp_path / "experiments" / "gate.toml", "--results", tmp_path / "results")
     assert result.exit_code == 1, result.output
     assert result.stdout.count("FAILS") == 1 and "holds" not in result.stdout
+    verdict, = json.loads((tmp_path / "results" / "gate" / "gate.json").read_text())["claims"]
+    assert verdict["ratio"] > verdict["claimed"]
