@@ -224,7 +224,8 @@ class RecordCache:
             path = sum(self.grid.child(p, n, i) << 5 * i for i in range(LEVELS))
             known = (entry & UNKNOWN) == 0
             first = dr.full(mi.UInt32, MISSING, len(self.table))
-            dr.scatter_reduce(dr.ReduceOp.Min, first, dr.arange(mi.UInt32, len(new)), slot)
+            # `Local`: by default each thread reduces into a copy of its own, whose size is compiled into the kernel.
+            dr.scatter_reduce(dr.ReduceOp.Min, first, dr.arange(mi.UInt32, len(new)), slot, mode=dr.ReduceMode.Local)
             first = dr.gather(mi.UInt32, first, dr.compress(first != MISSING))
             if len(first) < LEAST:
                 break

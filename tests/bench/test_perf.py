@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 import representations
 from olpm_bench.bench import perf
 from olpm_bench.cli import app
+from olpm_bench.scenes.load import load
 
 
 @pytest.mark.slow
@@ -30,6 +31,17 @@ def test_figures_of_the_issue(monkeypatch):
     for value in (figures["em_ns_per_particle"], figures["path_vertex_ns"], figures["unguided_vertex_ns"],
                   *figures["guided_vertex_ns"].values(), figures["peak_rss_mb"]):
         assert value > 0 and math.isfinite(value)
+
+
+@pytest.mark.slow
+def test_training_on_the_default_scene_compiles_nothing_after_warm_up(monkeypatch):
+    """As `measure` runs it, with fewer particles."""
+    monkeypatch.setattr(perf, "PARTICLES", {"photons": 30_000, "importons": 10_000})
+    monkeypatch.setattr(perf, "CAMERA_PATHS", 2 ** 14)
+    scene = load("door_ajar", width=64, height=36, max_depth=perf.MAX_DEPTH)
+    for particles, camera in ((8, 0), (1, 8)):
+        perf.training_passes(scene, min(particles, 4), min(camera, 4))
+        assert perf.training_passes(scene, particles, camera)[2] == 0
 
 
 @pytest.mark.parametrize("arguments, expected", [
