@@ -11,7 +11,7 @@ import numpy as np
 from olpm_bench.check.particles import many, nothing
 from olpm_bench.check.trials import Trials, both
 from olpm_bench.check.verdict import Failure, Verdict, exact
-from representations.state import append, copied, copy_records, from_numpy, to_numpy
+from representations.state import append, copy_records, from_numpy, to_numpy
 
 ATTEMPTS = 64               # to load a state where another one was in memory
 
@@ -92,7 +92,7 @@ def _indices(state: Any) -> list[int]:
 
 def _loaded(trials: Trials, arrays: dict[str, np.ndarray]) -> Any:
     """A state from a file."""
-    state = from_numpy(trials.like, {name: copied(type(getattr(trials.like, name)), array) for name, array in arrays.items()})
+    state = from_numpy(trials.like, arrays)
     dr.eval(state)
     return state
 
